@@ -1,0 +1,43 @@
+# Everything the project needs is installed by this file into .venv; no root, no system package.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+ARGS   ?=
+PYTEST_ARGS ?=
+
+.PHONY: help run test check format lock clean
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
+
+$(STAMP): requirements.lock pyproject.toml
+	@echo "setting up $(VENV) (once; some minutes on a slow line)" >&2
+	@$(PYTHON) -c 'import sys; sys.exit("graderd needs Python 3.11 or newer; make PYTHON=/path/to/python3.11") if sys.version_info < (3, 11) else None'
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+run: $(STAMP) ## drive the demonstration on the simulated grader (ARGS=--json for one object a line)
+	@$(BIN)/graderd demo $(ARGS)
+
+test: $(STAMP) ## run the tests
+	@$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not serial_only" $(PYTEST_ARGS)
+	@$(BIN)/python -m pytest -m serial_only $(PYTEST_ARGS)
+
+check: $(STAMP) ## lint, types, import contracts
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports --no-cache
+
+format: $(STAMP) ## apply the formatter and the safe fixes
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+lock: $(STAMP) ## pin every dependency again (needs uv on PATH)
+	uv pip compile --universal --python-version 3.11 --all-extras --generate-hashes --custom-compile-command "make lock" -q -o requirements.lock pyproject.toml
+
+clean: ## remove what the targets above made
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

@@ -1,0 +1,29 @@
+"""What a driver reports when something is wrong: a name and its detail, no judgement.
+
+How bad it is, what the operator reads and what clears it stands in the fault catalogue (``graderd.core.faults``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceFault:
+    """One present fault of one device.
+
+    ``device``: ``camera``, ``rotation``, ``lift_left``, ``lift_right``, ``tilt``, ``can``, ``servo_bus`` or ``daemon``.
+    ``condition``: the catalogue's name of the condition, for example ``no_reply``.
+    ``detail``: one line with the numbers, for example ``no status packet for 0.21 s (7 requests)``.
+    ``since_s``: monotonic time at which it was first seen.
+    """
+
+    device: str
+    condition: str
+    detail: str
+    since_s: float
+
+    @property
+    def name(self) -> str:
+        """``device.condition``, the name used in status, records and ``graderd explain``."""
+        return f"{self.device}.{self.condition}"

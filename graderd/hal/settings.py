@@ -1,0 +1,119 @@
+"""Settings of the devices, as the drivers take them. ``graderd.config`` composes them into the configuration file.
+
+Every number carries its unit in its name. Unknown keys are errors. Ranges are the device's where a manual gives them.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class Settings(BaseModel):
+    """Base of all settings: frozen, strict about unknown keys, defaults checked too."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+
+class RotatorSettings(Settings):
+    """Blade rotation: ROBOTIS PH54-200-S500-R on a serial port.
+
+    Calibration: ``blade_deg = sign * servo_deg / gear_ratio - zero_deg`` with servo_deg from the device's own zero
+    (Homing Offset stays 0).
+    """
+
+    port: str = Field("/dev/graderd/servo", description="serial port, or a udev symlink to it")
+    usb_serial_number: str = Field("", description="find the port by the adapter's USB serial number; empty: use port")
+    baud_n: int = Field(57_600, gt=0, description="bits per second; the factory setting of the PH54 is 57,600")
+    servo_id_n: int = Field(1, ge=0, le=252)
+    profile: str = Field("ph54_200_s500", description="name of the control table in firmware_profiles")
+    zero_deg: Finite = Field(0.0, description="blade angle read at the servo's zero, subtracted")
+    sign: Literal[1, -1] = Field(1, description="-1 where the servo turns the blade the other way round")
+    gear_ratio: Positive = Field(1.0, description="servo turns for one blade turn")
+    min_deg: Finite = Field(-60.0, description="soft limit at the blade")
+    max_deg: Finite = Field(60.0, description="soft limit at the blade")
+    velocity_deg_per_s: Positive = Field(30.0, description="profile velocity at the blade")
+    acceleration_deg_per_s2: Positive = Field(60.0, description="profile acceleration at the blade")
+    current_limit_a: Positive = Field(9.3, le=22.74, description="9.3 A is the continuous rating")
+    watchdog_s: Positive = Field(0.2, le=2.54, description="the servo's own bus watchdog, steps of 20 ms")
+    poll_hz: Positive = Field(50.0, le=200, description="telemetry reads a second")
+    goal_timeout_s: Positive = Field(0.2, description="a goal not renewed for so long becomes a hold")
+    reply_timeout_s: Positive = Field(0.25, description="no valid reply for so long: the servo is lost")
+    in_position_deg: Positive = Field(0.5, description="tolerance for arrival, and for moving uncommanded")
+    not_moving_s: Positive = Field(0.7, description="goal ahead and no movement for so long: commanded but not moving")
+    voltage_warn_low_v: Positive = 20.0
+    voltage_warn_high_v: Positive = 30.0
+    temperature_warn_c: Positive = 70.0
+    torque_at_disarm: Literal["off", "on"] = "off"
+    torque_at_exit: Literal["off", "on"] = "off"
+
+    @model_validator(mode="after")
+    def _limits(self) -> RotatorSettings:
+        if self.min_deg >= self.max_deg:
+            raise ValueError(f"min_deg ({self.min_deg}) must be below max_deg ({self.max_deg})")
+        return self
+
+
+class CanSettings(Settings):
+    """The J1939 bus of the actuators, opened by python-can."""
+
+    interface: Literal["socketcan", "slcan", "virtual"] = "socketcan"
+    channel: str = Field("can0", description="network interface, or the port of an slcan adapter")
+    bitrate_n: int = Field(250_000, gt=0, description="Electrak CNO: 250 kbit/s")
+    source_address_n: int = Field(0xE7, ge=0, le=253, description="our preferred address: 231, land levelling supervisor")
+    name_manufacturer_n: int = Field(0, ge=0, le=2047, description="SAE manufacturer code; 0: none assigned to graderd")
+    name_identity_n: int = Field(1, ge=0, le=0x1FFFFF)
+    name_function_n: int = Field(132, ge=0, le=255, description="132: single land levelling system supervisor")
+    name_function_instance_n: int = Field(0, ge=0, le=31)
+    name_ecu_instance_n: int = Field(0, ge=0, le=7)
+    name_vehicle_system_n: int = Field(0, ge=0, le=127)
+    name_vehicle_system_instance_n: int = Field(0, ge=0, le=15)
+    name_industry_group_n: int = Field(3, ge=0, le=7, description="3: construction equipment")
+    name_arbitrary_address: bool = Field(True, description="take another address where ours is contested and lost")
+    obey_commanded_address: bool = False
+    stop_pgn_n: int | None = Field(None, ge=0, le=0x3FFFF, description="a PGN of your choice whose arrival means stop")
+    stop_on_iso11783_all_stop: bool = Field(True, description="obey ISO 11783-7 'stop all implement operations'")
+
+
+class ActuatorSettings(Settings):
+    """One Electrak on the J1939 bus. The three instances are ``lift_left``, ``lift_right`` and ``tilt``."""
+
+    address_n: int = Field(19, ge=0, le=253, description="J1939 source address of the actuator")
+    profile: str = Field("electrak_hd_b017", description="name of the layout in firmware_profiles")
+    min_mm: NotNegative = Field(5.0, description="soft limit of extension")
+    max_mm: Positive = Field(295.0, description="soft limit of extension")
+    current_limit_a: Positive = Field(18.0, le=25.0)
+    speed_percent: int = Field(80, ge=20, le=100, multiple_of=5, description="motor duty in full-speed moves")
+    feedback_timeout_s: Positive = Field(0.35, description="three missing feedback messages: the actuator is lost")
+    target_timeout_s: Positive = Field(0.3, description="a target not renewed for so long becomes a hold")
+    overload_retries_n: int = Field(0, ge=0, le=5, description="automatic retries after an overload before it latches")
+
+    @model_validator(mode="after")
+    def _limits(self) -> ActuatorSettings:
+        if self.min_mm >= self.max_mm:
+            raise ValueError(f"min_mm ({self.min_mm}) must be below max_mm ({self.max_mm})")
+        return self
+
+
+class CameraSettings(Settings):
+    """Where pictures come from and how the camera is set."""
+
+    source: Literal["realsense", "recording", "rig", "folder", "video", "frame_set"] = "realsense"
+    path: str = Field("", description="recording, folder, video, frame set, or the rig's camera socket")
+    serial_number: str = Field("", description="of the RealSense camera; empty: the only one attached")
+    color_width_px: int = Field(1280, gt=0)
+    color_height_px: int = Field(800, gt=0)
+    depth_width_px: int = Field(848, ge=0, description="0: colour only")
+    depth_height_px: int = Field(480, ge=0)
+    rate_hz: Positive = 30.0
+    repeat: bool = Field(False, description="start a recording or folder over at its end")
+    exposure_us: Positive | None = Field(None, description="None: automatic")
+    gain: Positive | None = None
+    white_balance_k: Positive | None = Field(4600.0, description="None: automatic (not advised: colour would drift)")
+    stale_s: Positive = Field(0.5, description="no frame for so long: unknown at once")
+    restart_s: Positive = Field(2.0, description="no frame for so long: the worker process is restarted")
