@@ -28,7 +28,13 @@ class Intrinsics:
         """The same lens read out at another size (pixel centres at integers)."""
         sx, sy = width / self.width, height / self.height
         return Intrinsics(
-            width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, self.coeffs
+            width,
+            height,
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
+            self.coeffs,
         )
 
 

@@ -19,5 +19,3 @@ class Lifecycle(StrEnum):
     STANDBY = "standby"
     ACTIVE = "active"
     FAILED = "failed"
-
-

@@ -65,7 +65,9 @@ class CanSettings(Settings):
     interface: Literal["socketcan", "slcan", "virtual"] = "socketcan"
     channel: str = Field("can0", description="network interface, or the port of an slcan adapter")
     bitrate_n: int = Field(250_000, gt=0, description="Electrak CNO: 250 kbit/s")
-    source_address_n: int = Field(0xE7, ge=0, le=253, description="our preferred address: 231, land levelling supervisor")
+    source_address_n: int = Field(
+        0xE7, ge=0, le=253, description="our preferred address: 231, land levelling supervisor"
+    )
     name_manufacturer_n: int = Field(0, ge=0, le=2047, description="SAE manufacturer code; 0: none assigned to graderd")
     name_identity_n: int = Field(1, ge=0, le=0x1FFFFF)
     name_function_n: int = Field(132, ge=0, le=255, description="132: single land levelling system supervisor")

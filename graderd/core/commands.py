@@ -1,0 +1,106 @@
+"""What a client may ask for. The same models serve the state machine, the HTTP interface and the CLI."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+AXIS_UNITS = {
+    "rotate": "deg",
+    "lift": "mm",
+    "tilt": "mm",
+    "height": "mm",
+    "slope": "deg",
+    "pitch": "deg",
+}
+
+
+class _Command(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    client: str = Field("", max_length=80, description="who asks; one client commands at a time")
+
+
+class Arm(_Command):
+    """Power the devices and hold; refused while a mandatory requirement is unmet."""
+
+    command: Literal["arm"] = "arm"
+
+
+class Disarm(_Command):
+    """Hold, then take power away as configured."""
+
+    command: Literal["disarm"] = "disarm"
+
+
+class Stop(_Command):
+    """End motion at once and latch. Wins over everything; idempotent."""
+
+    command: Literal["stop"] = "stop"
+    reason: str = Field("stop command", max_length=200)
+
+
+class Reset(_Command):
+    """Leave the latched stop for disarmed."""
+
+    command: Literal["reset"] = "reset"
+
+
+class Auto(_Command):
+    """Let the rule turn the blade by what the camera sees."""
+
+    command: Literal["auto"] = "auto"
+
+
+class Manual(_Command):
+    """Hold and take jogs."""
+
+    command: Literal["manual"] = "manual"
+
+
+class Jog(_Command):
+    """Move one axis while the lease is renewed.
+
+    ``axis``: rotate (deg), lift (mm of both lifts), tilt (mm), height (mm at the blade's centre), slope (deg),
+    pitch (deg). ``relative``: the value is added to where the blade is now.
+    """
+
+    command: Literal["jog"] = "jog"
+    axis: Literal["rotate", "lift", "tilt", "height", "slope", "pitch"]
+    value: Annotated[float, Field(allow_inf_nan=False, description="in the axis's unit: deg or mm")]
+    relative: bool = False
+
+
+class Preset(_Command):
+    """Move to a named pose from the configuration while the lease is renewed."""
+
+    command: Literal["preset"] = "preset"
+    name: str = Field(max_length=80)
+
+
+class Renew(_Command):
+    """Keep the lease of the jog in progress."""
+
+    command: Literal["renew"] = "renew"
+
+
+class Release(_Command):
+    """Give the lease back: hold where the blade is."""
+
+    command: Literal["release"] = "release"
+
+
+Command = Arm | Disarm | Stop | Reset | Auto | Manual | Jog | Preset | Renew | Release
+AnyCommand = Annotated[Command, Field(discriminator="command")]
+
+
+class Reply(BaseModel):
+    """Answer to one command: what happened, and what to do where it was refused."""
+
+    model_config = ConfigDict(frozen=True)
+
+    command: str
+    accepted: bool
+    message: str
+    remedy: str = ""

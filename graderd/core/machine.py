@@ -1,0 +1,337 @@
+"""The state machine: ``step(state, inputs, settings) -> (state, intents, replies)``. No I/O, no clock, no surprises.
+
+Modes: DISARMED (devices unpowered or held), MANUAL (armed, takes jogs), AUTO (armed, the rule turns the blade),
+STOPPED (latched; left only by reset, which leads to DISARMED). Nothing moves outside MANUAL and AUTO.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+from graderd.core import commands as cmd
+from graderd.core.faults import ALL_AXES, ActiveFault, Reaction, held_axes, worst
+from graderd.core.rule import Decision, RuleSettings, decide
+from graderd.core.zones import SoilObservation
+from graderd.hal.settings import Positive, Settings
+
+
+class Mode(StrEnum):
+    """See the module's text."""
+
+    DISARMED = "disarmed"
+    MANUAL = "manual"
+    AUTO = "auto"
+    STOPPED = "stopped"
+
+
+ARMED = (Mode.MANUAL, Mode.AUTO)
+
+
+class MachineSettings(Settings):
+    """Times of the state machine."""
+
+    arm_timeout_s: Positive = 5.0
+    lease_s: Positive = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Goals:
+    """Where each axis shall go; None: stay where it is."""
+
+    rotation_deg: float | None = None
+    lift_left_mm: float | None = None
+    lift_right_mm: float | None = None
+    tilt_mm: float | None = None
+
+    @property
+    def empty(self) -> bool:
+        """Whether every axis stays."""
+        return self == Goals()
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Measured positions that are fresh enough to act on; None where stale."""
+
+    rotation_deg: float | None = None
+    lift_left_mm: float | None = None
+    lift_right_mm: float | None = None
+    tilt_mm: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Unmet:
+    """A mandatory requirement for arming that is not met."""
+
+    name: str
+    reason: str
+    remedy: str
+
+
+@dataclass(frozen=True, slots=True)
+class Lease:
+    """The right to move, held by one client until ``expires_s`` unless renewed."""
+
+    client: str
+    expires_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """All memory of the machine."""
+
+    mode: Mode = Mode.DISARMED
+    reason: str = "started disarmed"
+    arming_since_s: float | None = None
+    goals: Goals = field(default_factory=Goals)
+    later: tuple[Goals, ...] = ()
+    lease: Lease | None = None
+    decision: Decision = field(default_factory=Decision)
+    holding: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """What is known at one tick.
+
+    ``observation``: a new one, not handed in before. ``settled``: every commanded axis is at its goal.
+    ``devices_active``: all required devices are ACTIVE. ``arm_error``: why arming the devices failed, once.
+    ``resolve``: turns a jog or preset into goals in stages, or gives the reason it cannot.
+    """
+
+    now_s: float
+    resolve: Callable[[cmd.Jog | cmd.Preset, Pose], tuple[Goals, ...] | str]
+    commands: tuple[cmd.Command, ...] = ()
+    observation: SoilObservation | None = None
+    pose: Pose = field(default_factory=Pose)
+    settled: bool = True
+    devices_active: bool = False
+    arm_error: str = ""
+    unmet: tuple[Unmet, ...] = ()
+    faults: tuple[ActiveFault, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Intents:
+    """What the machine wants of the devices this tick; the gate has the last word.
+
+    ``power``: devices shall be ACTIVE. ``stop``: motion must end now.
+    """
+
+    goals: Goals = field(default_factory=Goals)
+    power: bool = False
+    stop: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Result of one step."""
+
+    state: State
+    intents: Intents
+    replies: tuple[cmd.Reply, ...] = ()
+
+
+def step(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSettings) -> Step:
+    """One tick: faults first, then commands in their order, then automatic operation."""
+    state = _react(state, inputs)
+    replies: list[cmd.Reply] = []
+    for command in sorted(inputs.commands, key=lambda c: not isinstance(c, cmd.Stop)):
+        state, reply = _obey(state, command, inputs, settings)
+        replies.append(reply)
+    state = _advance(state, inputs, settings, rule)
+    armed = state.mode in ARMED
+    return Step(
+        state,
+        Intents(
+            goals=_unheld(state.goals, held_axes(inputs.faults)) if armed else Goals(),
+            power=armed or state.arming_since_s is not None,
+            stop=state.mode is Mode.STOPPED,
+        ),
+        tuple(replies),
+    )
+
+
+def _react(state: State, inputs: Inputs) -> State:
+    """The reactions of faults and lost devices; they come before any command."""
+    fault = worst(inputs.faults)
+    if fault is not None and fault.row.reaction is Reaction.STOP and state.mode is not Mode.STOPPED:
+        return _stopped(f"{fault.name}: {fault.row.reads}")
+    if state.mode is Mode.STOPPED:
+        return state
+    if fault is not None and fault.row.reaction >= Reaction.DISARM:
+        if state.mode is not Mode.DISARMED or state.arming_since_s is not None:
+            return _disarmed(f"{fault.name}: {fault.row.reads}")
+        return state
+    if state.mode in ARMED and not inputs.devices_active:
+        return _disarmed("a device left its active state")
+    if fault is not None and fault.row.reaction is Reaction.RETREAT and state.mode is Mode.AUTO:
+        return replace(_manual(f"{fault.name}: {fault.row.reads}"), holding=state.holding)
+    return state
+
+
+def _obey(state: State, command: cmd.Command, inputs: Inputs, settings: MachineSettings) -> tuple[State, cmd.Reply]:
+    def yes(new: State, message: str) -> tuple[State, cmd.Reply]:
+        return new, cmd.Reply(command=command.command, accepted=True, message=message)
+
+    def no(message: str, remedy: str) -> tuple[State, cmd.Reply]:
+        return state, cmd.Reply(command=command.command, accepted=False, message=message, remedy=remedy)
+
+    match command:
+        case cmd.Stop():
+            if state.mode is Mode.STOPPED:
+                return yes(state, f"already stopped: {state.reason}")
+            by = f" (by {command.client})" if command.client else ""
+            return yes(_stopped(command.reason + by), "stopped")
+        case cmd.Disarm():
+            if state.mode is Mode.STOPPED:
+                return yes(state, "stopped, and so already without power")
+            return yes(_disarmed("disarm command"), "disarmed")
+        case cmd.Reset():
+            if state.mode is not Mode.STOPPED:
+                return yes(state, f"nothing to reset: {state.mode}")
+            standing = worst(f for f in inputs.faults if f.present and f.row.reaction is Reaction.STOP)
+            if standing is not None:
+                return no(f"{standing.name} is still present: {standing.row.reads}", standing.row.remedy)
+            return yes(_disarmed("reset"), "reset; arm when the area around the blade is clear")
+        case cmd.Renew() | cmd.Release():
+            return _lease_command(state, command, inputs.now_s, settings, yes, no)
+    if state.lease is not None and state.lease.client != command.client:
+        return no(
+            f"{state.lease.client or 'another client'} is moving the blade",
+            "wait until it is done, or send stop",
+        )
+    match command:
+        case cmd.Arm():
+            return _arm(state, inputs, yes, no)
+        case cmd.Auto():
+            if state.mode not in ARMED:
+                return no(
+                    f"automatic operation needs an armed machine; it is {state.mode}",
+                    _way_to_armed(state.mode),
+                )
+            if state.mode is Mode.AUTO:
+                return yes(state, "already automatic")
+            return yes(replace(_manual("automatic operation"), mode=Mode.AUTO), "automatic")
+        case cmd.Manual():
+            if state.mode not in ARMED:
+                return no(f"manual operation needs an armed machine; it is {state.mode}", _way_to_armed(state.mode))
+            return yes(_manual("manual operation"), "manual")
+        case cmd.Jog() | cmd.Preset():
+            if state.mode is not Mode.MANUAL:
+                return no(
+                    f"moving by hand needs manual mode; the machine is {state.mode}",
+                    _way_to_manual(state.mode),
+                )
+            stages = inputs.resolve(command, inputs.pose)
+            if isinstance(stages, str):
+                return no(stages, "ask for a position inside the limits")
+            lease = Lease(command.client, inputs.now_s + settings.lease_s)
+            moving = replace(state, goals=stages[0], later=stages[1:], lease=lease, reason=f"{command.command} by hand")
+            return yes(moving, "moving while the lease is renewed")
+
+
+def _lease_command(
+    state: State,
+    command: cmd.Renew | cmd.Release,
+    now_s: float,
+    settings: MachineSettings,
+    yes: Callable[[State, str], tuple[State, cmd.Reply]],
+    no: Callable[[str, str], tuple[State, cmd.Reply]],
+) -> tuple[State, cmd.Reply]:
+    if state.lease is None or state.lease.client != command.client:
+        return no("you hold no lease", "send the jog again")
+    if isinstance(command, cmd.Renew):
+        return yes(replace(state, lease=Lease(command.client, now_s + settings.lease_s)), "renewed")
+    return yes(_manual("released"), "released; holding")
+
+
+def _arm(
+    state: State,
+    inputs: Inputs,
+    yes: Callable[[State, str], tuple[State, cmd.Reply]],
+    no: Callable[[str, str], tuple[State, cmd.Reply]],
+) -> tuple[State, cmd.Reply]:
+    if state.mode is Mode.STOPPED:
+        return no(f"stopped: {state.reason}", "reset first, then arm")
+    if state.mode in ARMED:
+        return yes(state, f"already armed: {state.mode}")
+    if state.arming_since_s is not None:
+        return yes(state, "arming")
+    if inputs.unmet:
+        return no(
+            "not ready: " + "; ".join(f"{u.name}: {u.reason}" for u in inputs.unmet),
+            "; ".join(dict.fromkeys(u.remedy for u in inputs.unmet if u.remedy)),
+        )
+    return yes(replace(state, arming_since_s=inputs.now_s, reason="arming"), "arming")
+
+
+def _advance(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSettings) -> State:
+    """Finish arming, let leases lapse, go to a preset's next stage, follow the rule."""
+    if state.arming_since_s is not None:
+        if inputs.devices_active:
+            return _manual("armed")
+        if inputs.arm_error:
+            return _disarmed(f"arming failed: {inputs.arm_error}")
+        if inputs.now_s - state.arming_since_s > settings.arm_timeout_s:
+            return _disarmed(f"arming took longer than {settings.arm_timeout_s:g} s")
+        return state
+    if state.lease is not None and inputs.now_s > state.lease.expires_s:
+        return _manual(f"lease of {state.lease.client or 'the client'} lapsed")
+    if state.mode is Mode.MANUAL and state.later and inputs.settled:
+        state = replace(state, goals=state.later[0], later=state.later[1:])
+    if state.mode is Mode.AUTO:
+        decision = decide(state.decision, inputs.observation, inputs.settled, inputs.now_s, rule)
+        state = replace(state, decision=decision, goals=Goals(rotation_deg=decision.angle_deg))
+    if state.mode in ARMED:
+        return replace(state, holding=_why_holding(state, inputs))
+    return state
+
+
+def _why_holding(state: State, inputs: Inputs) -> tuple[str, ...]:
+    reasons = [
+        f"{f.name} since {inputs.now_s - f.since_s:.1f} s: {f.row.reads}"
+        for f in inputs.faults
+        if f.row.reaction >= Reaction.HOLD
+    ]
+    if state.mode is Mode.AUTO and state.decision.zone is None and not reasons:
+        reasons.append("no decision yet: the camera has not shown soil clearly enough")
+    return tuple(reasons)
+
+
+def _unheld(goals: Goals, held: frozenset[str]) -> Goals:
+    """Goals without those of the axes that must stay."""
+    if held == ALL_AXES:
+        return Goals()
+    return Goals(
+        rotation_deg=None if "rotation" in held else goals.rotation_deg,
+        lift_left_mm=None if "lift" in held else goals.lift_left_mm,
+        lift_right_mm=None if "lift" in held else goals.lift_right_mm,
+        tilt_mm=None if "tilt" in held else goals.tilt_mm,
+    )
+
+
+def _stopped(reason: str) -> State:
+    return State(mode=Mode.STOPPED, reason=reason)
+
+
+def _disarmed(reason: str) -> State:
+    return State(mode=Mode.DISARMED, reason=reason)
+
+
+def _manual(reason: str) -> State:
+    return State(mode=Mode.MANUAL, reason=reason)
+
+
+def _way_to_armed(mode: Mode) -> str:
+    return "reset, then arm" if mode is Mode.STOPPED else "arm first"
+
+
+def _way_to_manual(mode: Mode) -> str:
+    return {
+        Mode.STOPPED: "reset, arm, then manual",
+        Mode.DISARMED: "arm first",
+        Mode.AUTO: "send manual first",
+    }[mode]
