@@ -1,4 +1,4 @@
-"""Geometry of the blade in the vehicle frame (x forward, y left, z up, metres; origin = rotation axis on the ground)."""
+"""Geometry of the blade in the vehicle frame: x forward, y left, z up, metres, origin = rotation axis on the ground."""
 
 from __future__ import annotations
 

@@ -112,12 +112,12 @@ class GateInputs:
     """``dt_s``: since the last pass. ``height_mm``: of the cutting edge, None where unknown. ``lease_ok``: the client
     that asked for the motion still holds its lease, or nobody's lease is needed (automatic operation)."""
 
+    settings: GateSettings
     mode: Mode
     pose: Pose
     dt_s: float
     lease_ok: bool
     height_mm: float | None = None
-    settings: GateSettings = field(default_factory=GateSettings)
 
 
 @dataclass(frozen=True, slots=True)

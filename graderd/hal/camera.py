@@ -104,7 +104,7 @@ class Camera(Protocol):
         ...
 
     def settings_read_back(self) -> dict[str, float]:
-        """What is set on the device, as read back: ``exposure_us``, ``gain``, ``white_balance_k``, ``auto_exposure``…"""
+        """What is set on the device, as read back: ``exposure_us``, ``gain``, ``white_balance_k`` and so on."""
         ...
 
     def reset_hardware(self) -> None:

@@ -90,5 +90,5 @@ class Rotator(Protocol):
         ...
 
     async def close(self) -> None:
-        """Any state -> closed: as :meth:`disarm` if active (torque as ``torque_at_exit`` says), then let go of the wire."""
+        """Any state -> closed: hold if active, torque as ``torque_at_exit`` says, then let go of the wire."""
         ...

@@ -1,0 +1,147 @@
+"""What the daemon tells its clients: one model for HTTP, WebSocket, CLI, page and records. Units are in the names."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict
+
+from graderd.core.machine import Mode
+from graderd.core.zones import Zone
+from graderd.hal.lifecycle import Lifecycle
+
+
+class _Status(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class AxisStatus(_Status):
+    """One axis, in degrees (rotation) or millimetres: requested, limited, sent and measured are all visible."""
+
+    name: str
+    unit: str
+    lifecycle: Lifecycle
+    requested: float | None = None
+    limited: float | None = None
+    limited_because: str = ""
+    sent: float | None = None
+    measured: float | None = None
+    measured_age_s: float | None = None
+    velocity_per_s: float | None = None
+    current_a: float | None = None
+    torque_nm: float | None = None
+    voltage_v: float | None = None
+    temperature_c: float | None = None
+    duty_percent: float | None = None
+    moving: bool | None = None
+    in_position: bool | None = None
+    torque_on: bool | None = None
+    thermal_load: float | None = None
+    flags: tuple[str, ...] = ()
+    counters: dict[str, int] = {}
+
+
+class AttitudeStatus(_Status):
+    """Blade attitude from the actuators' extensions; None where an extension is not known."""
+
+    height_mm: float | None = None
+    slope_deg: float | None = None
+    pitch_deg: float | None = None
+
+
+class SoilStatus(_Status):
+    """The newest observation of the soil."""
+
+    zone: Zone = Zone.UNKNOWN
+    confidence: float = 0.0
+    reason: str = "no picture yet"
+    age_s: float | None = None
+    share_left: float = 0.0
+    share_center: float = 0.0
+    share_right: float = 0.0
+    volume_left_l: float | None = None
+    volume_center_l: float | None = None
+    volume_right_l: float | None = None
+    blade_angle_deg: float | None = None
+    frame_number_n: int = -1
+    frames_per_s: float = 0.0
+    method: str = ""
+
+
+class DecisionStatus(_Status):
+    """What automatic operation decided last."""
+
+    zone: Zone | None = None
+    angle_deg: float | None = None
+    age_s: float | None = None
+    reason: str = ""
+
+
+class FaultStatus(_Status):
+    """One active fault, with what to do about it."""
+
+    name: str
+    reads: str
+    detail: str
+    remedy: str
+    reaction: str
+    clears: str
+    age_s: float
+    present: bool
+
+
+class RequirementStatus(_Status):
+    """One requirement for arming."""
+
+    name: str
+    met: bool
+    mandatory: bool
+    reason: str
+    remedy: str
+
+
+class LeaseStatus(_Status):
+    """Who may move the blade now."""
+
+    client: str
+    remaining_s: float
+
+
+class CameraStatus(_Status):
+    """The perception worker and its camera."""
+
+    lifecycle: Lifecycle = Lifecycle.CLOSED
+    description: str = ""
+    restarts_n: int = 0
+    rung: str = ""
+    settings_read_back: dict[str, float] = {}
+
+
+class TickStatus(_Status):
+    """Health of the control tick."""
+
+    rate_hz: float = 0.0
+    overruns_n: int = 0
+    lateness_p99_ms: float = 0.0
+
+
+class Status(_Status):
+    """Everything at one moment. ``time_s`` is monotonic, ``wall_time`` ISO 8601 UTC."""
+
+    time_s: float
+    wall_time: str
+    version: str
+    simulated: bool
+    mode: Mode
+    reason: str
+    arming: bool = False
+    holding: tuple[str, ...] = ()
+    last_stop: str = ""
+    soil: SoilStatus = SoilStatus()
+    decision: DecisionStatus = DecisionStatus()
+    axes: dict[str, AxisStatus] = {}
+    attitude: AttitudeStatus = AttitudeStatus()
+    faults: tuple[FaultStatus, ...] = ()
+    readiness: tuple[RequirementStatus, ...] = ()
+    lease: LeaseStatus | None = None
+    camera: CameraStatus = CameraStatus()
+    tick: TickStatus = TickStatus()
+    presets: tuple[str, ...] = ()
