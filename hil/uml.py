@@ -1,0 +1,199 @@
+"""Run a command as root in a user-mode Linux guest that sees this machine's files: ``python3 -m hil.uml -- COMMAND…``.
+
+The guest boots Debian's ``user-mode-linux`` kernel (which has SocketCAN, vcan, slcan and the kernel's J1939 as
+modules) on this machine's own root directory, read-only under an overlay in memory, with systemd as its first
+process. So the project, its virtual environment and the installed tools are simply there, and whatever the guest
+installs or deletes vanishes with it. Only ``--out`` is written through to the host.
+
+Exit status: the command's; 124 when the time ran out; 125 when the guest ended without a result.
+Needs the packages ``hil/setup`` installs, and no root on the host (files only root may read stay unreadable then).
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event, Thread
+
+TIMED_OUT = 124
+GUEST_DIED = 125
+KERNEL = Path("/usr/bin/linux.uml")
+MODULES = Path("/usr/lib/uml/modules")
+BUSYBOX = Path("/bin/busybox")
+INIT = Path(__file__).with_name("guest") / "init"
+PASSED_ON = ("PYTEST_ARGS", "GRADERD_HIL_SEED", "TERM")
+
+
+class LaunchError(Exception):
+    """The guest cannot be started; the text says what to install or change."""
+
+
+@dataclass(frozen=True, slots=True)
+class Guest:
+    """What to run and with how much. ``memory_mib`` also holds everything the guest writes."""
+
+    command: Sequence[str]
+    out: Path
+    directory: Path = field(default_factory=Path.cwd)
+    timeout_s: float = 600.0
+    memory_mib: int = 3072
+    kernel: Path = KERNEL
+    kernel_args: tuple[str, ...] = ()
+
+    def run(self, *, follow: bool = True) -> int:
+        """Boot, run, power off; print the command's output while it comes. Returns the exit status described above."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        for name in ("exit", "log", "journal", "graceful"):
+            (self.out / name).unlink(missing_ok=True)
+        (self.out / "log").touch()
+        (self.out / "guest-command").write_text(self._script(), encoding="utf-8")
+        with tempfile.TemporaryDirectory(prefix="graderd-hil-") as scratch, contextlib.ExitStack() as stack:
+            initramfs = build_initramfs(Path(scratch))
+            console = stack.enter_context((self.out / "console").open("wb"))
+            process = stack.enter_context(_guest_process(self._command_line(initramfs), console.fileno(), scratch))
+            done = Event()
+            follower = Thread(target=_follow, args=(self.out / "log", done), name="guest log")
+            if follow:
+                follower.start()
+            try:
+                process.wait(self.timeout_s)
+                timed_out = False
+            except subprocess.TimeoutExpired:
+                timed_out = True
+            finally:
+                done.set()
+                if follow:
+                    follower.join()
+        if timed_out:
+            return TIMED_OUT
+        try:
+            return int((self.out / "exit").read_text(encoding="ascii"))
+        except (FileNotFoundError, ValueError):
+            return GUEST_DIED
+
+    def _script(self) -> str:
+        exports = "".join(
+            f"export {name}={shlex.quote(os.environ[name])}\n" for name in PASSED_ON if name in os.environ
+        )
+        return (
+            f"{exports}cd {shlex.quote(str(self.directory))} || exit 1\n"
+            f"{shlex.join(self.command)}\n"
+            'echo $? > "$HIL_OUT/exit.new" && mv "$HIL_OUT/exit.new" "$HIL_OUT/exit"\n'
+            'journalctl --boot --no-pager -o short-monotonic > "$HIL_OUT/journal" 2>&1\n'
+            "# A command that wants the ordinary, ordered shutdown leaves this file.\n"
+            'if [ -e "$HIL_OUT/graceful" ]; then systemctl poweroff --no-block; else systemctl poweroff --force; fi\n'
+        )
+
+    def _command_line(self, initramfs: Path) -> list[str]:
+        return [
+            str(self.kernel),
+            f"mem={self.memory_mib}M",
+            f"initrd={initramfs}",
+            "con=null",
+            "ssl=null",
+            "con0=null,fd:1",
+            "console=tty0",
+            "quiet",
+            "panic=-1",
+            f"hil_out={self.out.resolve()}",
+            *self.kernel_args,
+        ]
+
+
+def missing() -> list[str]:
+    """What the launcher needs and this machine has not, as paths."""
+    found = [KERNEL, BUSYBOX]
+    absent = [str(path) for path in found if not path.exists()]
+    if not any(MODULES.glob("*/kernel/fs/overlayfs/overlay.ko")):
+        absent.append(f"{MODULES}/*/kernel/fs/overlayfs/overlay.ko")
+    if shutil.which("cpio") is None:
+        absent.append("cpio")
+    return absent
+
+
+def build_initramfs(directory: Path) -> Path:
+    """Pack busybox, the overlay module and our ``init`` into ``directory/initramfs`` (about 1.3 MB)."""
+    root = directory / "root"
+    (root / "bin").mkdir(parents=True)
+    shutil.copy(BUSYBOX, root / "bin" / "busybox")
+    shutil.copy(INIT, root / "init")
+    (root / "init").chmod(0o755)
+    shutil.copy(next(MODULES.glob("*/kernel/fs/overlayfs/overlay.ko")), root / "overlay.ko")
+    names = "\n".join(str(path.relative_to(root)) for path in sorted(root.rglob("*")))
+    archive = directory / "initramfs"
+    with archive.open("wb") as target:
+        subprocess.run(
+            ["cpio", "--create", "--format=newc", "--quiet"], cwd=root, input=names.encode(), stdout=target, check=True
+        )
+    return archive
+
+
+@contextlib.contextmanager
+def _guest_process(command: Sequence[str], output_fd: int, scratch: str) -> Iterator[subprocess.Popen[bytes]]:
+    """The kernel in a process group of its own, all of which is gone afterwards whatever happens."""
+    # The kernel keeps its memory and its sockets in these; the scratch directory takes them away again.
+    environment = {**os.environ, "TMPDIR": "/dev/shm" if os.access("/dev/shm", os.W_OK) else scratch, "HOME": scratch}
+    process = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=output_fd, stderr=output_fd, env=environment, start_new_session=True
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def _follow(path: Path, done: Event) -> None:
+    """Copy what is appended to ``path`` to standard output until ``done``, then the rest."""
+    with path.open("rb") as source:
+        while True:
+            last = done.is_set()
+            while block := source.read(65536):
+                sys.stdout.buffer.write(block)
+                sys.stdout.buffer.flush()
+            if last:
+                return
+            done.wait(0.2)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line of the launcher."""
+    parser = argparse.ArgumentParser(prog="python3 -m hil.uml", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-t", "--timeout", type=float, default=600.0, metavar="SECONDS")
+    parser.add_argument("-m", "--memory", type=int, default=3072, metavar="MIB")
+    parser.add_argument("-o", "--out", type=Path, help="keep log, journal, console and result files here")
+    parser.add_argument("command", nargs="+", help="what to run in the guest, after --")
+    options = parser.parse_args(arguments)
+    absent = missing()
+    if absent:
+        sys.stderr.write(f"hil: no {', '.join(absent)}. Run `sudo hil/setup` (Debian, Ubuntu) once\n")
+        return GUEST_DIED
+    with contextlib.ExitStack() as stack:
+        out = options.out or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="graderd-hil-out-")))
+        guest = Guest(options.command, out.resolve(), timeout_s=options.timeout, memory_mib=options.memory)
+        began_s = time.monotonic()
+        status = guest.run()
+        if status in (TIMED_OUT, GUEST_DIED):
+            said = (out / "console").read_text(encoding="utf-8", errors="replace").strip()
+            reason = f"no result in {options.timeout:g} s" if status == TIMED_OUT else "the guest ended with no result"
+            sys.stderr.write(f"hil: {reason}\n" + "".join(f"  {line}\n" for line in said.splitlines()[-15:]))
+        sys.stderr.write(f"hil: guest up and down in {time.monotonic() - began_s:.1f} s, status {status}\n")
+        return status
+
+
+if __name__ == "__main__":
+    # A terminated launcher must still take its guest away.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    sys.exit(main())
