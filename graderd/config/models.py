@@ -1,0 +1,149 @@
+"""The configuration file as one strict, frozen model. Sections carry the devices' names; numbers carry their units."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from graderd.core.attitude import AttitudeGeometry, Preset
+from graderd.core.blade import BladeGeometry
+from graderd.core.gate import GateSettings
+from graderd.core.machine import MachineSettings
+from graderd.core.rule import RuleSettings
+from graderd.hal.settings import (
+    ActuatorSettings,
+    CameraSettings,
+    CanSettings,
+    NotNegative,
+    Positive,
+    RotatorSettings,
+    Settings,
+)
+from graderd.perception.settings import CameraCalibration, PerceptionSettings
+
+
+class ControlSettings(Settings):
+    """The control tick and what it takes for fresh."""
+
+    tick_hz: float = Field(50.0, ge=10, le=200)
+    rotation_max_age_s: Positive = Field(0.2, description="an older angle counts as unknown: the rotation holds")
+    actuator_max_age_s: Positive = Field(0.4, description="feedback comes every 105 ms")
+    rotation_tolerance_deg: Positive = Field(0.5, description="arrived")
+    actuator_tolerance_mm: Positive = Field(1.5, description="arrived; the actuators rest 1-2 mm short")
+    overrun_s: Positive = Field(0.1, description="a tick later than this is a fault")
+    shutdown_order: tuple[Literal["rotation", "actuators"], ...] = ("actuators", "rotation")
+    shutdown_timeout_s: Positive = Field(1.5, description="for all devices together; then the wires are dropped")
+
+    @model_validator(mode="after")
+    def _order(self) -> ControlSettings:
+        if sorted(self.shutdown_order) != ["actuators", "rotation"]:
+            raise ValueError("shutdown_order names rotation and actuators, each once")
+        return self
+
+
+class TcpSettings(Settings):
+    """The loopback page and interface; off unless a token is set."""
+
+    host: str = "127.0.0.1"
+    port_n: int = Field(8127, ge=1, le=65535)
+    token: str = Field(min_length=16, description="clients send it as 'Authorization: Bearer ...'")
+    allowed_hosts: tuple[str, ...] = ("127.0.0.1", "localhost")
+
+
+class ApiSettings(Settings):
+    """Where clients reach the daemon."""
+
+    socket: str = Field("/run/graderd/graderd.sock", description="unix socket; its file rights decide who may use it")
+    socket_mode: str = Field("0660", pattern=r"^0[0-7]{3}$")
+    socket_group: str = Field("", description="group of the socket; empty: the daemon's own")
+    tcp: TcpSettings | None = None
+
+
+class RecordingSettings(Settings):
+    """What is written down, and how much disk it may take."""
+
+    directory: str = Field("", description="empty: nothing is recorded")
+    rate_hz: Positive = Field(10.0, le=50)
+    max_mb: NotNegative = Field(500.0, description="oldest recordings go first")
+    min_free_mb: NotNegative = Field(200.0, description="recording pauses below this; control goes on")
+
+
+class StateSettings(Settings):
+    """What survives a restart: the reason of the last stop."""
+
+    directory: str = Field("", description="empty: $STATE_DIRECTORY as systemd gives it, else nothing is kept")
+
+
+class CameraSection(CameraSettings):
+    """The camera with its calibration."""
+
+    calibration: CameraCalibration = Field(default_factory=CameraCalibration)
+
+
+def _lift_left() -> ActuatorSettings:
+    return ActuatorSettings(address_n=19)
+
+
+def _lift_right() -> ActuatorSettings:
+    return ActuatorSettings(address_n=20)
+
+
+def _tilt() -> ActuatorSettings:
+    return ActuatorSettings(address_n=27, profile="electrak_md_a050", min_mm=3.0, max_mm=97.0, current_limit_a=3.5)
+
+
+def _presets() -> dict[str, Preset]:
+    return {
+        "cast_left": Preset(rotation_deg=30.0, height_mm=0.0, slope_deg=0.0),
+        "cast_right": Preset(rotation_deg=-30.0, height_mm=0.0, slope_deg=0.0),
+        "center": Preset(rotation_deg=0.0, height_mm=0.0, slope_deg=0.0, pitch_deg=0.0),
+        "transport": Preset(rotation_deg=0.0, height_mm=150.0, slope_deg=0.0, lift_before_rotation=True),
+        "ditch": Preset(rotation_deg=45.0, height_mm=20.0, slope_deg=6.0, lift_before_rotation=True),
+    }
+
+
+class Config(Settings):
+    """Everything. Sections that are absent take their defaults."""
+
+    version: Literal[1] = 1
+    simulated: bool = False
+    camera: CameraSection = Field(default_factory=CameraSection)
+    perception: PerceptionSettings = Field(default_factory=PerceptionSettings)
+    blade: BladeGeometry = Field(default_factory=BladeGeometry)
+    rotation: RotatorSettings = Field(default_factory=RotatorSettings)
+    can: CanSettings = Field(default_factory=CanSettings)
+    lift_left: ActuatorSettings = Field(default_factory=_lift_left)
+    lift_right: ActuatorSettings = Field(default_factory=_lift_right)
+    tilt: ActuatorSettings = Field(default_factory=_tilt)
+    attitude: AttitudeGeometry = Field(default_factory=AttitudeGeometry)
+    rule: RuleSettings = Field(default_factory=RuleSettings)
+    gate: GateSettings = Field(default_factory=GateSettings)
+    machine: MachineSettings = Field(default_factory=MachineSettings)
+    control: ControlSettings = Field(default_factory=ControlSettings)
+    api: ApiSettings = Field(default_factory=ApiSettings)
+    recording: RecordingSettings = Field(default_factory=RecordingSettings)
+    state: StateSettings = Field(default_factory=StateSettings)
+    presets: dict[str, Preset] = Field(default_factory=_presets)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Config:
+        addresses = [
+            self.lift_left.address_n,
+            self.lift_right.address_n,
+            self.tilt.address_n,
+            self.can.source_address_n,
+        ]
+        if len(set(addresses)) != len(addresses):
+            raise ValueError(f"lift_left, lift_right, tilt and can need four different addresses, not {addresses}")
+        if self.gate.rotation_min_deg < self.rotation.min_deg or self.gate.rotation_max_deg > self.rotation.max_deg:
+            raise ValueError("gate.rotation_min_deg/max_deg must lie inside rotation.min_deg/max_deg")
+        for zone, angle_deg in (
+            ("left_deg", self.rule.left_deg),
+            ("right_deg", self.rule.right_deg),
+            ("center_deg", self.rule.center_deg),
+            ("even_deg", self.rule.even_deg),
+        ):
+            if not self.gate.rotation_min_deg <= angle_deg <= self.gate.rotation_max_deg:
+                raise ValueError(f"rule.{zone} ({angle_deg:g}) lies outside gate.rotation_min_deg..rotation_max_deg")
+        return self

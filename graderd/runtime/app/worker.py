@@ -1,0 +1,157 @@
+"""The perception child: owns the camera, judges every frame, can be killed at any moment without harm.
+
+Run by the daemon as ``python -m graderd.runtime.app.worker``; speaks ``worker_protocol`` on stdin and stdout.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import sys
+import threading
+from bisect import bisect_left
+from collections import deque
+from typing import BinaryIO
+
+import cv2
+from pydantic import BaseModel, ValidationError
+
+from graderd.hal.camera import Camera, EndOfFrames, Frame
+from graderd.hal.errors import DeviceError, DeviceTimeoutError
+from graderd.hal.settings import CameraSettings
+from graderd.perception import Classifier, make_classifier
+from graderd.runtime.app.frame_sources import open_camera
+from graderd.runtime.worker_protocol import Angle, Observed, Opened, Preview, Start, ToChild, Trouble
+
+JPEG_QUALITY = 80
+
+
+class AngleHistory:
+    """The last second or two of measured blade angles, to know the angle at the moment of exposure."""
+
+    def __init__(self, length_n: int = 128) -> None:
+        self._samples: deque[tuple[float, float]] = deque(maxlen=length_n)
+
+    def add(self, time_s: float, angle_deg: float) -> None:
+        """Append a sample; an older or equal time than the newest is ignored."""
+        if not self._samples or time_s > self._samples[-1][0]:
+            self._samples.append((time_s, angle_deg))
+
+    def at(self, time_s: float) -> tuple[float, float]:
+        """Angle at ``time_s`` (interpolated) and the age of what it rests on; no sample at all is infinitely old."""
+        samples = list(self._samples)
+        if not samples:
+            return 0.0, float("inf")
+        after = bisect_left(samples, (time_s, float("-inf")))
+        if after == len(samples):
+            newest_s, angle_deg = samples[-1]
+            return angle_deg, time_s - newest_s
+        if after == 0:
+            oldest_s, angle_deg = samples[0]
+            return angle_deg, oldest_s - time_s
+        (t0, a0), (t1, a1) = samples[after - 1], samples[after]
+        share = (time_s - t0) / (t1 - t0)
+        return a0 + share * (a1 - a0), min(time_s - t0, t1 - time_s)
+
+
+class Worker:
+    """The child's two threads: one reads the daemon's lines, the main one reads the camera."""
+
+    def __init__(self, start: Start, lines: BinaryIO, out: BinaryIO) -> None:
+        self._start = start
+        self._lines = lines
+        self._out = out
+        self._angles = AngleHistory()
+        self._preview_wanted = threading.Event()
+
+    def _send(self, message: BaseModel) -> None:
+        self._out.write(message.model_dump_json().encode() + b"\n")
+        self._out.flush()
+
+    def _listen(self) -> None:
+        """Until the daemon's end of the pipe closes; then the process goes at once, hung library call or not."""
+        for line in self._lines:
+            message = ToChild.validate_json(line)
+            if isinstance(message, Angle):
+                self._angles.add(message.time_s, message.angle_deg)
+            else:
+                self._preview_wanted.set()
+        os._exit(0)
+
+    def run(self) -> int:
+        """Open the camera, judge frames until something ends it. Returns the exit status."""
+        threading.Thread(target=self._listen, name="daemon-lines", daemon=True).start()
+        settings = self._start.camera
+        try:
+            camera = open_camera(settings)
+            if self._start.reset_first:
+                camera.reset_hardware()
+            camera.open()
+        except DeviceError as error:
+            self._send(Trouble(condition="missing", message=str(error), final=True))
+            return 4
+        read_back = camera.settings_read_back()
+        self._send(
+            Opened(
+                description=camera.description,
+                settings_read_back=read_back,
+                not_kept=settings_not_kept(settings, read_back),
+            )
+        )
+        classifier = make_classifier(self._start.perception, self._start.calibration, self._start.blade)
+        try:
+            return self._judge(camera, classifier)
+        finally:
+            camera.close()
+
+    def _judge(self, camera: Camera, classifier: Classifier) -> int:
+        while True:
+            try:
+                frame = camera.read(self._start.camera.stale_s)
+            except DeviceTimeoutError as error:
+                self._send(Trouble(condition="stale", message=str(error)))
+                continue
+            except EndOfFrames:
+                self._send(Trouble(condition="missing", message="the recording came to its end", final=True))
+                return 0
+            except DeviceError as error:
+                self._send(Trouble(condition="missing", message=str(error), final=True))
+                return 3
+            angle_deg, age_s = self._angles.at(frame.capture_s)
+            observation = classifier.classify(frame, angle_deg, age_s)
+            self._send(Observed.of(observation))
+            if self._preview_wanted.is_set():
+                self._preview_wanted.clear()
+                self._send(Preview(jpeg_base64=_jpeg(classifier, frame, observation)))
+
+
+def _jpeg(classifier: Classifier, frame: Frame, observation: object) -> str:
+    picture = classifier.annotate(frame, observation)  # type: ignore[arg-type]  # same observation as just made
+    ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return base64.b64encode(data.tobytes()).decode() if ok else ""
+
+
+def settings_not_kept(settings: CameraSettings, read_back: dict[str, float]) -> tuple[str, ...]:
+    """Settings whose read-back value is more than 5 % off what was asked for."""
+    wrong = []
+    for name in ("exposure_us", "gain", "white_balance_k"):
+        wanted = getattr(settings, name)
+        got = read_back.get(name)
+        if wanted is not None and got is not None and abs(got - wanted) > 0.05 * wanted:
+            wrong.append(f"{name}: asked {wanted:g}, device says {got:g}")
+    return tuple(wrong)
+
+
+def main() -> int:
+    """Entry point of the child process."""
+    cv2.setNumThreads(1)  # one core is the control loop's
+    try:
+        start = Start.model_validate_json(sys.stdin.buffer.readline())
+    except ValidationError as error:
+        sys.stderr.write(f"graderd worker: not started by the daemon: {error.errors()[0]['msg']}\n")
+        return 2
+    return Worker(start, sys.stdin.buffer, sys.stdout.buffer).run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,242 @@
+"""The daemon's side of perception: keeps the child alive, takes its newest observation, says what is wrong.
+
+Ladder when frames stop: stale -> unknown at once; child killed and started again with back-off; the camera's hardware
+reset before the third open. Each rung is reported.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import logging
+import sys
+from collections import deque
+
+from pydantic import BaseModel, ValidationError
+
+from graderd.core.blade import BladeGeometry
+from graderd.core.status import CameraStatus
+from graderd.core.zones import SoilObservation
+from graderd.hal.clock import Clock
+from graderd.hal.fault import DeviceFault
+from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.settings import CameraSettings
+from graderd.perception.settings import CameraCalibration, PerceptionSettings
+from graderd.runtime.worker_protocol import Angle, FromChild, Observed, Opened, Preview, PreviewRequest, Start, Trouble
+
+WORKER_MODULE = "graderd.runtime.app.worker"
+START_GRACE_S = 15.0
+"""A child may take so long from its start to its first word (imports, camera start)."""
+RESET_BEFORE_OPEN_N = 3
+BACK_OFF_S = (0.5, 1.0, 2.0, 5.0, 10.0)
+RESTART_SHOWN_S = 5.0
+MAX_LINE_BYTES = 8 * 1024 * 1024
+MAX_UNSENT_BYTES = 64 * 1024
+
+log = logging.getLogger(__name__)
+
+
+class PerceptionWorker:
+    """Supervises the perception child. All methods belong to the daemon's event loop; the sync ones never wait."""
+
+    def __init__(
+        self,
+        camera: CameraSettings,
+        calibration: CameraCalibration,
+        perception: PerceptionSettings,
+        blade: BladeGeometry,
+        clock: Clock,
+        command: tuple[str, ...] = (sys.executable, "-m", WORKER_MODULE),
+    ) -> None:
+        self._start = Start(camera=camera, calibration=calibration, perception=perception, blade=blade)
+        self._camera = camera
+        self._clock = clock
+        self._command = command
+        self._process: asyncio.subprocess.Process | None = None
+        self._newest: SoilObservation | None = None
+        self._taken = True
+        self._opened: Opened | None = None
+        self._trouble: Trouble | None = None
+        self._last_word_s = clock.now_s()
+        self._no_frame_since_s = clock.now_s()
+        self._restarted_s: float | None = None
+        self._killed_hung = False
+        self._opens_without_frame_n = 0
+        self._restarts_n = 0
+        self._frame_times: deque[float] = deque(maxlen=30)
+        self._preview: asyncio.Future[bytes] | None = None
+
+    @property
+    def newest(self) -> SoilObservation | None:
+        """The newest observation, whether taken or not."""
+        return self._newest
+
+    def take_observation(self) -> SoilObservation | None:
+        """The newest observation if it was not taken before and is not stale; else None."""
+        if self._taken or self._newest is None:
+            return None
+        self._taken = True
+        if self._clock.now_s() - self._newest.capture_s > self._camera.stale_s:
+            return None
+        return self._newest
+
+    @property
+    def frames_per_s(self) -> float:
+        """Rate of the last frames; 0 when they stopped."""
+        times = self._frame_times
+        if len(times) < 2 or self._clock.now_s() - times[-1] > self._camera.stale_s:
+            return 0.0
+        return (len(times) - 1) / max(times[-1] - times[0], 1e-3)
+
+    def status(self) -> CameraStatus:
+        """For people."""
+        if self._process is None:
+            lifecycle = Lifecycle.CLOSED
+        elif self._opened is None or self._is_stale():
+            lifecycle = Lifecycle.FAILED if self._is_stale() else Lifecycle.STANDBY
+        else:
+            lifecycle = Lifecycle.ACTIVE
+        rung = ""
+        if self._is_stale():
+            rung = "waiting for frames" if not self._restarts_n else f"worker restarted {self._restarts_n} times"
+            if self._opens_without_frame_n >= RESET_BEFORE_OPEN_N:
+                rung += ", camera reset"
+        return CameraStatus(
+            lifecycle=lifecycle,
+            description=self._opened.description if self._opened else "",
+            restarts_n=self._restarts_n,
+            rung=rung,
+            settings_read_back=self._opened.settings_read_back if self._opened else {},
+        )
+
+    def faults(self) -> tuple[DeviceFault, ...]:
+        """What is wrong with camera, worker and picture now."""
+        now_s = self._clock.now_s()
+        found = []
+        if self._is_stale():
+            condition, detail = "stale", f"no frame for {now_s - self._no_frame_since_s:.1f} s"
+            if self._trouble is not None and self._trouble.final:
+                condition, detail = self._trouble.condition, self._trouble.message
+            found.append(DeviceFault("camera", condition, detail, self._no_frame_since_s))
+        elif self._newest is not None:
+            found += [DeviceFault("camera", f.condition, f.detail, self._newest.capture_s) for f in self._newest.faults]
+        if self._restarted_s is not None and now_s - self._restarted_s < RESTART_SHOWN_S:
+            condition = "worker_hung" if self._killed_hung else "worker_restarted"
+            found.append(DeviceFault("camera", condition, f"restart {self._restarts_n}", self._restarted_s))
+        if self._opened is not None and self._opened.not_kept:
+            found.append(
+                DeviceFault("camera", "settings_not_kept", "; ".join(self._opened.not_kept), self._last_word_s)
+            )
+        return tuple(found)
+
+    def _is_stale(self) -> bool:
+        return self._clock.now_s() - self._no_frame_since_s > self._camera.stale_s
+
+    def send_angle(self, angle_deg: float, time_s: float) -> None:
+        """Tell the child the measured blade angle; dropped while the child does not read."""
+        self._write(Angle(angle_deg=angle_deg, time_s=time_s))
+
+    async def preview_jpeg(self, timeout_s: float = 3.0) -> bytes:
+        """The next frame's annotated picture.
+
+        Raises:
+            TimeoutError: none came.
+        """
+        if self._preview is None or self._preview.done():
+            self._preview = asyncio.get_running_loop().create_future()
+            self._write(PreviewRequest())
+        return await asyncio.wait_for(asyncio.shield(self._preview), timeout_s)
+
+    def _write(self, message: BaseModel) -> None:
+        process = self._process
+        if process is None or process.stdin is None or process.stdin.is_closing():
+            return
+        if process.stdin.transport.get_write_buffer_size() < MAX_UNSENT_BYTES:
+            process.stdin.write(message.model_dump_json().encode() + b"\n")
+
+    async def run(self) -> None:
+        """Keep a child running until cancelled; its end, hang or silence leads to the next rung."""
+        try:
+            while True:
+                await self._one_child()
+                self._restarts_n += 1
+                self._opens_without_frame_n += 1
+                self._restarted_s = self._clock.now_s()
+                pause_s = BACK_OFF_S[min(self._opens_without_frame_n, len(BACK_OFF_S)) - 1]
+                log.warning("perception worker ended (restart %d in %.1f s)", self._restarts_n, pause_s)
+                await asyncio.sleep(pause_s)
+        finally:
+            await self._kill()
+
+    async def _one_child(self) -> None:
+        reset_first = self._opens_without_frame_n == RESET_BEFORE_OPEN_N - 1
+        self._opened, self._trouble = None, None
+        self._last_word_s = self._clock.now_s() + START_GRACE_S - self._camera.restart_s
+        self._process = await asyncio.create_subprocess_exec(
+            *self._command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=MAX_LINE_BYTES
+        )
+        assert self._process.stdin is not None  # asked for above
+        assert self._process.stdout is not None
+        start = self._start.model_copy(update={"reset_first": reset_first})
+        self._process.stdin.write(start.model_dump_json().encode() + b"\n")
+        self._killed_hung = False
+        try:
+            while await self._one_line(self._process.stdout):
+                pass
+        finally:
+            await self._kill()
+
+    async def _one_line(self, lines: asyncio.StreamReader) -> bool:
+        """Handle the child's next line. False: it ended, spoke nonsense or has been silent for too long."""
+        silent_s = self._clock.now_s() - self._last_word_s
+        try:
+            line = await asyncio.wait_for(lines.readline(), max(0.05, self._camera.restart_s - silent_s))
+        except TimeoutError:
+            self._killed_hung = True
+            log.warning("perception worker said nothing for %.1f s: killing it", self._camera.restart_s)
+            return False
+        except ValueError:
+            log.warning("perception worker sent an overlong line: killing it")
+            return False
+        if not line:
+            return False
+        try:
+            message = FromChild.validate_json(line)
+        except ValidationError:
+            log.warning("perception worker sent something else than its protocol: killing it")
+            return False
+        self._last_word_s = self._clock.now_s()
+        return self._take(message)
+
+    def _take(self, message: Opened | Observed | Trouble | Preview) -> bool:
+        if isinstance(message, Observed):
+            self._newest, self._taken = message.unpack(), False
+            self._no_frame_since_s = self._last_word_s
+            self._frame_times.append(self._newest.capture_s)
+            self._trouble = None
+            self._opens_without_frame_n = 0
+        elif isinstance(message, Opened):
+            self._opened = message
+            log.info("camera open: %s", message.description)
+        elif isinstance(message, Trouble):
+            if self._trouble is None or self._trouble.message != message.message:
+                log.warning("camera: %s", message.message)
+            self._trouble = message
+            # Alive but without frames for too long: the ladder goes on all the same.
+            return self._clock.now_s() - self._no_frame_since_s < self._camera.restart_s
+        elif self._preview is not None and not self._preview.done():
+            self._preview.set_result(base64.b64decode(message.jpeg_base64))
+        return True
+
+    async def _kill(self) -> None:
+        """End the child, hung or not, and wait for it (a killed process is gone in milliseconds)."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        if process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+        if process.stdin is not None:
+            process.stdin.close()
+        await process.wait()

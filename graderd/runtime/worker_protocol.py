@@ -1,0 +1,96 @@
+"""What the daemon and its perception child say to each other: one JSON object a line, both ways.
+
+To the child: first a :class:`Start`, then ``Angle`` at the control rate and ``PreviewRequest`` when someone looks.
+From the child: ``Opened``, ``Observed`` for every frame, ``Trouble``, ``Preview``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+
+from graderd.core.blade import BladeGeometry
+from graderd.core.zones import PictureFault, SoilObservation, Zone
+from graderd.hal.settings import CameraSettings
+from graderd.perception.settings import CameraCalibration, PerceptionSettings
+
+
+class _Message(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Start(_Message):
+    """Everything the child needs to know."""
+
+    kind: Literal["start"] = "start"
+    camera: CameraSettings
+    calibration: CameraCalibration
+    perception: PerceptionSettings
+    blade: BladeGeometry
+    reset_first: bool = False
+
+
+class Angle(_Message):
+    """The measured blade angle and its monotonic time."""
+
+    kind: Literal["angle"] = "angle"
+    angle_deg: float
+    time_s: float
+
+
+class PreviewRequest(_Message):
+    """Send the next frame's annotated picture."""
+
+    kind: Literal["preview"] = "preview"
+
+
+class Opened(_Message):
+    """The camera is open."""
+
+    kind: Literal["opened"] = "opened"
+    description: str
+    settings_read_back: dict[str, float]
+    not_kept: tuple[str, ...] = ()
+
+
+class Observed(_Message):
+    """One frame was judged; ``observation`` as :class:`SoilObservation`'s fields."""
+
+    kind: Literal["observed"] = "observed"
+    observation: dict[str, Any]
+
+    @classmethod
+    def of(cls, observation: SoilObservation) -> Observed:
+        """Pack an observation."""
+        return cls(observation=asdict(observation))
+
+    def unpack(self) -> SoilObservation:
+        """The observation again."""
+        fields = dict(self.observation)
+        fields["zone"] = Zone(fields["zone"])
+        fields["faults"] = tuple(PictureFault(**f) for f in fields["faults"])
+        return SoilObservation(**fields)
+
+
+class Trouble(_Message):
+    """No frame now; ``condition`` is a row of the fault catalogue's camera part. ``final``: the child gives up."""
+
+    kind: Literal["trouble"] = "trouble"
+    condition: str
+    message: str
+    final: bool = False
+
+
+class Preview(_Message):
+    """An annotated picture, JPEG, base64."""
+
+    kind: Literal["preview"] = "preview"
+    jpeg_base64: str
+
+
+ToChild = TypeAdapter[Angle | PreviewRequest](Annotated[Angle | PreviewRequest, Field(discriminator="kind")])
+FromChild = TypeAdapter[Opened | Observed | Trouble | Preview](
+    Annotated[Opened | Observed | Trouble | Preview, Field(discriminator="kind")]
+)
