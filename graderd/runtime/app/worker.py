@@ -145,12 +145,15 @@ def settings_not_kept(settings: CameraSettings, read_back: dict[str, float]) -> 
 def main() -> int:
     """Entry point of the child process."""
     cv2.setNumThreads(1)  # one core is the control loop's
+    # A camera library that prints must not be able to spoil the protocol: its stdout becomes stderr.
+    out = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     try:
         start = Start.model_validate_json(sys.stdin.buffer.readline())
     except ValidationError as error:
         sys.stderr.write(f"graderd worker: not started by the daemon: {error.errors()[0]['msg']}\n")
         return 2
-    return Worker(start, sys.stdin.buffer, sys.stdout.buffer).run()
+    return Worker(start, sys.stdin.buffer, out).run()
 
 
 if __name__ == "__main__":

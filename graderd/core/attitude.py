@@ -1,0 +1,74 @@
+"""Blade attitude: height, cross slope and pitch of the cutting edge from the actuators' extensions, and back.
+
+Two lifts carry the blade left and right of its centre, the tilt actuator pitches it. Height is that of the cutting
+edge's centre above the ground (mm), slope is positive when the left end is higher (deg), pitch is positive when the
+moldboard's top leans forward (deg). Small-angle geometry of a 1/4-scale machine; all numbers are settings.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pydantic import Field
+
+from graderd.hal.settings import Finite, NotNegative, Positive, Settings
+
+
+class AttitudeGeometry(Settings):
+    """How extensions become attitude."""
+
+    lift_ground_mm: NotNegative = Field(100.0, description="extension of both lifts with the edge on the ground")
+    lift_spacing_mm: Positive = Field(800.0, description="between the two lifts, across the machine")
+    lift_raises_by_extending: bool = True
+    lift_height_ratio: Positive = Field(1.0, description="mm of edge height for one mm of lift extension")
+    tilt_level_mm: NotNegative = Field(50.0, description="extension of the tilt actuator with pitch 0")
+    tilt_deg_per_mm: Finite = Field(0.30, description="pitch for one mm; negative where extending leans it back")
+
+
+class Preset(Settings):
+    """A pose named by what the operator means; axes not named stay where they are."""
+
+    rotation_deg: Finite | None = None
+    height_mm: Finite | None = None
+    slope_deg: Finite | None = None
+    pitch_deg: Finite | None = None
+    lift_before_rotation: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """Height of the cutting edge's centre (mm) and cross slope (deg)."""
+
+    height_mm: float
+    slope_deg: float
+
+
+def lift_attitude(geometry: AttitudeGeometry, left_mm: float, right_mm: float) -> Attitude:
+    """Height and slope from the two lifts' extensions."""
+    sense = 1.0 if geometry.lift_raises_by_extending else -1.0
+    left_height = sense * geometry.lift_height_ratio * (left_mm - geometry.lift_ground_mm)
+    right_height = sense * geometry.lift_height_ratio * (right_mm - geometry.lift_ground_mm)
+    slope_deg = math.degrees(math.atan2(left_height - right_height, geometry.lift_spacing_mm))
+    return Attitude((left_height + right_height) / 2.0, slope_deg)
+
+
+def lift_extensions(geometry: AttitudeGeometry, attitude: Attitude) -> tuple[float, float]:
+    """Left and right lift extension (mm) for a height and slope; the inverse of :func:`lift_attitude`."""
+    sense = 1.0 if geometry.lift_raises_by_extending else -1.0
+    half = math.tan(math.radians(attitude.slope_deg)) * geometry.lift_spacing_mm / 2.0
+    scale = sense / geometry.lift_height_ratio
+    return (
+        geometry.lift_ground_mm + scale * (attitude.height_mm + half),
+        geometry.lift_ground_mm + scale * (attitude.height_mm - half),
+    )
+
+
+def pitch_deg(geometry: AttitudeGeometry, tilt_mm: float) -> float:
+    """Pitch from the tilt actuator's extension."""
+    return (tilt_mm - geometry.tilt_level_mm) * geometry.tilt_deg_per_mm
+
+
+def tilt_extension(geometry: AttitudeGeometry, pitch: float) -> float:
+    """Tilt extension (mm) for a pitch (deg); the inverse of :func:`pitch_deg`."""
+    return geometry.tilt_level_mm + pitch / geometry.tilt_deg_per_mm

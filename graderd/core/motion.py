@@ -1,0 +1,117 @@
+"""Turns what an operator asks (a jog, a preset) into goals of the axes, in stages; refuses what is out of reach."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from graderd.core.attitude import (
+    Attitude,
+    AttitudeGeometry,
+    Preset,
+    lift_attitude,
+    lift_extensions,
+    pitch_deg,
+    tilt_extension,
+)
+from graderd.core.commands import AXIS_UNITS, Jog
+from graderd.core.commands import Preset as PresetCommand
+from graderd.core.machine import Goals, Pose
+
+Limits = Mapping[str, tuple[float, float]]
+"""Low and high of each axis: deg for ``rotation``, mm of extension for the others."""
+
+
+def resolve(
+    command: Jog | PresetCommand,
+    pose: Pose,
+    geometry: AttitudeGeometry,
+    presets: Mapping[str, Preset],
+    limits: Limits,
+) -> tuple[Goals, ...] | str:
+    """Goals in stages, or why they cannot be: no measurement to start from, unknown preset, beyond a limit."""
+    if isinstance(command, Jog):
+        goals = _jog(command, pose, geometry)
+        if isinstance(goals, str):
+            return goals
+        stages: tuple[Goals, ...] = (goals,)
+    else:
+        preset = presets.get(command.name)
+        if preset is None:
+            return f"there is no preset '{command.name}'; there are: {', '.join(sorted(presets)) or 'none'}"
+        made = _preset(preset, pose, geometry)
+        if isinstance(made, str):
+            return made
+        stages = made
+    for goals in stages:
+        problem = _beyond(goals, limits)
+        if problem:
+            return problem
+    return stages
+
+
+def _jog(jog: Jog, pose: Pose, geometry: AttitudeGeometry) -> Goals | str:
+    if jog.axis == "rotate":
+        start = pose.rotation_deg if jog.relative else 0.0
+        return _no_start(jog) if start is None else Goals(rotation_deg=start + jog.value)
+    if jog.axis in ("tilt", "pitch"):
+        return _jog_tilt(jog, pose, geometry)
+    if pose.lift_left_mm is None or pose.lift_right_mm is None:
+        return _no_start(jog)
+    if jog.axis == "lift":
+        if jog.relative:
+            return Goals(lift_left_mm=pose.lift_left_mm + jog.value, lift_right_mm=pose.lift_right_mm + jog.value)
+        return Goals(lift_left_mm=jog.value, lift_right_mm=jog.value)
+    now = lift_attitude(geometry, pose.lift_left_mm, pose.lift_right_mm)
+    if jog.axis == "height":
+        wanted = Attitude(jog.value + (now.height_mm if jog.relative else 0.0), now.slope_deg)
+    else:
+        wanted = Attitude(now.height_mm, jog.value + (now.slope_deg if jog.relative else 0.0))
+    left_mm, right_mm = lift_extensions(geometry, wanted)
+    return Goals(lift_left_mm=left_mm, lift_right_mm=right_mm)
+
+
+def _jog_tilt(jog: Jog, pose: Pose, geometry: AttitudeGeometry) -> Goals | str:
+    if jog.relative and pose.tilt_mm is None:
+        return _no_start(jog)
+    start_mm = pose.tilt_mm if jog.relative and pose.tilt_mm is not None else 0.0
+    if jog.axis == "tilt":
+        return Goals(tilt_mm=start_mm + jog.value)
+    start_deg = pitch_deg(geometry, start_mm) if jog.relative else 0.0
+    return Goals(tilt_mm=tilt_extension(geometry, start_deg + jog.value))
+
+
+def _preset(preset: Preset, pose: Pose, geometry: AttitudeGeometry) -> tuple[Goals, ...] | str:
+    left_mm = right_mm = None
+    if preset.height_mm is not None or preset.slope_deg is not None:
+        if pose.lift_left_mm is None or pose.lift_right_mm is None:
+            return "the lifts' positions are not known now"
+        now = lift_attitude(geometry, pose.lift_left_mm, pose.lift_right_mm)
+        wanted = Attitude(
+            now.height_mm if preset.height_mm is None else preset.height_mm,
+            now.slope_deg if preset.slope_deg is None else preset.slope_deg,
+        )
+        left_mm, right_mm = lift_extensions(geometry, wanted)
+    tilt_mm = None if preset.pitch_deg is None else tilt_extension(geometry, preset.pitch_deg)
+    everything = Goals(preset.rotation_deg, left_mm, right_mm, tilt_mm)
+    if preset.lift_before_rotation and preset.rotation_deg is not None and left_mm is not None:
+        return (Goals(None, left_mm, right_mm, tilt_mm), everything)
+    return (everything,)
+
+
+def _no_start(jog: Jog) -> str:
+    return f"the position of '{jog.axis}' is not known now, so it cannot be moved from there"
+
+
+def _beyond(goals: Goals, limits: Limits) -> str:
+    wanted = {
+        "rotation": goals.rotation_deg,
+        "lift_left": goals.lift_left_mm,
+        "lift_right": goals.lift_right_mm,
+        "tilt": goals.tilt_mm,
+    }
+    for axis, value in wanted.items():
+        low, high = limits[axis]
+        unit = AXIS_UNITS["rotate"] if axis == "rotation" else "mm"
+        if value is not None and not low <= value <= high:
+            return f"{axis} would go to {value:.1f} {unit}, beyond its limits of {low:g} to {high:g} {unit}"
+    return ""

@@ -1,0 +1,105 @@
+"""The simulated grader: starts the rig as a process of its own, or attaches to one that runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from graderd.config import Config
+from graderd.hal.errors import DeviceMissingError
+
+READY_TIMEOUT_S = 30.0
+RESTART_PAUSE_S = 1.0
+
+log = logging.getLogger(__name__)
+
+
+class RigProcess:
+    """``python -m drivers.rig`` in ``directory``; kept alive while :meth:`run` runs."""
+
+    def __init__(self, directory: Path, arguments: tuple[str, ...] = ()) -> None:
+        self.directory = directory
+        self._arguments = arguments
+        self._process: asyncio.subprocess.Process | None = None
+
+    async def start(self) -> None:
+        """Start the rig and wait until it says it is ready.
+
+        Raises:
+            DeviceMissingError: it ended or did not get ready.
+        """
+        ready = self.directory / "rig.json"
+        ready.unlink(missing_ok=True)
+        self._process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "drivers.rig", "--dir", str(self.directory), *self._arguments, start_new_session=True
+        )
+        deadline = asyncio.get_running_loop().time() + READY_TIMEOUT_S
+        while not ready.exists():
+            if self._process.returncode is not None:
+                raise DeviceMissingError("rig", f"ended with status {self._process.returncode} before it was ready")
+            if asyncio.get_running_loop().time() > deadline:
+                await self.stop()
+                raise DeviceMissingError("rig", f"not ready after {READY_TIMEOUT_S:g} s")
+            await asyncio.sleep(0.02)
+
+    async def run(self) -> None:
+        """Start it again whenever it ends, until cancelled."""
+        try:
+            while True:
+                if self._process is not None:
+                    await self._process.wait()
+                    log.warning("the rig ended (status %s): starting it again", self._process.returncode)
+                    await asyncio.sleep(RESTART_PAUSE_S)
+                await self.start()
+        finally:
+            await self.stop()
+
+    async def stop(self) -> None:
+        """End the rig and wait for it."""
+        process, self._process = self._process, None
+        if process is None or process.returncode is not None:
+            return
+        with contextlib.suppress(ProcessLookupError):
+            process.terminate()
+        try:
+            await asyncio.wait_for(process.wait(), 2.0)
+        except TimeoutError:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
+
+
+def new_rig_directory() -> Path:
+    """A private directory for the rig's sockets and ptys."""
+    base = os.environ.get("RUNTIME_DIRECTORY") or os.environ.get("XDG_RUNTIME_DIR")
+    return Path(tempfile.mkdtemp(prefix="graderd-rig-", dir=base if base and os.access(base, os.W_OK) else None))
+
+
+def attach(config: Config, directory: Path) -> Config:
+    """The configuration with every wire replaced by the rig's.
+
+    Raises:
+        DeviceMissingError: no rig is ready in that directory.
+    """
+    path = directory / "rig.json"
+    try:
+        rig: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DeviceMissingError(
+            str(path), f"no rig is ready there ({error})", "Start one: graderd rig --dir DIR"
+        ) from None
+    camera = {"source": "rig", "path": rig["camera"]}
+    changes = {
+        "simulated": True,
+        "camera": config.camera.model_copy(update=camera),
+        "rotation": config.rotation.model_copy(update={"port": rig["servo"], "usb_serial_number": ""}),
+        "can": config.can.model_copy(update=rig["can"]),
+    }
+    return config.model_copy(update=changes)

@@ -1,0 +1,284 @@
+"""The control tick: takes the newest of everything, decides, limits, commands, feeds the watchdog. Never waits."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol
+
+from graderd.config import Config
+from graderd.core import commands as cmd
+from graderd.core.fault_catalogue import CATALOGUE
+from graderd.core.faults import Clear, FaultState, clear_faults, update_faults
+from graderd.core.gate import AxisPass, GateInputs, GateState, pass_gate
+from graderd.core.lift import LiftCoordinator
+from graderd.core.machine import ARMED, Goals, Inputs, Intents, Mode, Pose, State, step
+from graderd.core.motion import resolve
+from graderd.core.zones import SoilObservation
+from graderd.hal.clock import Clock
+from graderd.hal.errors import DeviceError
+from graderd.hal.fault import DeviceFault
+from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.reading import Reading
+from graderd.runtime.devices import ACTUATOR_NAMES, Devices
+from graderd.runtime.power import PowerKeeper
+from graderd.runtime.readiness import requirements
+from graderd.runtime.state_file import StateFile
+
+MAX_COMMANDS_PER_TICK = 32
+LATENESS_WINDOW_N = 500
+
+log = logging.getLogger(__name__)
+
+
+class Eyes(Protocol):
+    """What the control loop wants of perception."""
+
+    def take_observation(self) -> SoilObservation | None:
+        """A new observation, once."""
+        ...
+
+    def faults(self) -> tuple[DeviceFault, ...]:
+        """What is wrong with camera and picture."""
+        ...
+
+    def send_angle(self, angle_deg: float, time_s: float) -> None:
+        """Tell perception the measured angle."""
+        ...
+
+
+class ControlLoop:
+    """Owns the machine's state. One per daemon."""
+
+    def __init__(
+        self,
+        config: Config,
+        devices: Devices,
+        eyes: Eyes,
+        clock: Clock,
+        state_file: StateFile,
+        on_tick: Callable[[ControlLoop], None] = lambda loop: None,
+    ) -> None:
+        self.config = config
+        self.devices = devices
+        self.state = State()
+        self.faults = FaultState()
+        self.passed: dict[str, AxisPass] = {}
+        self.intents = Intents()
+        self.overruns_n = 0
+        self.lateness_s: deque[float] = deque(maxlen=LATENESS_WINDOW_N)
+        self.time_s = clock.now_s()
+        self.last_stop = state_file.load()
+        self.connection_problems: dict[str, str] = {}
+        self.extra_faults: list[Callable[[float], tuple[DeviceFault, ...]]] = []
+        self._eyes = eyes
+        self._clock = clock
+        self._state_file = state_file
+        self._on_tick = on_tick
+        self._gate = GateState()
+        self._lift = LiftCoordinator(config.attitude)
+        self._power = PowerKeeper(devices)
+        self._queue: deque[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = deque()
+        self._wake = asyncio.Event()
+        self._moving: set[str] = set()
+        self._late_since_s: float | None = None
+        self._hold_failed: tuple[str, ...] = ()
+
+    # ---- commands -------------------------------------------------------------------------------------------------
+
+    async def command(self, command: cmd.Command) -> cmd.Reply:
+        """Hand a command to the next tick and wait for its reply. Stop acts on the wires before it returns."""
+        if isinstance(command, cmd.Stop):
+            return self.stop_now(command)
+        future: asyncio.Future[cmd.Reply] = asyncio.get_running_loop().create_future()
+        self._queue.append((command, future))
+        return await future
+
+    def stop_now(self, command: cmd.Stop) -> cmd.Reply:
+        """Stop without waiting for a tick: hold on every wire now, then latch."""
+        self._hold_failed = self.devices.hold_all()
+        self._moving.clear()
+        reply = self._step((command,))[0]
+        self._wake.set()
+        return reply
+
+    # ---- the tick -------------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Tick at the configured rate until cancelled. A late tick is counted, and not made up for."""
+        period_s = 1.0 / self.config.control.tick_hz
+        due_s = self._clock.now_s()
+        try:
+            while True:
+                late_s = self._clock.now_s() - due_s
+                self.lateness_s.append(max(0.0, late_s))
+                if late_s > self.config.control.overrun_s:
+                    self.overruns_n += 1
+                    self._late_since_s = self._clock.now_s()
+                self.tick()
+                due_s = max(due_s + period_s, self._clock.now_s())
+                await asyncio.sleep(max(0.0, due_s - self._clock.now_s()))
+        finally:
+            await self._power.close()
+
+    def tick(self) -> None:
+        """One turn of sense, decide, limit, act."""
+        queued = [self._queue.popleft() for _ in range(min(len(self._queue), MAX_COMMANDS_PER_TICK))]
+        replies = self._step(tuple(command for command, _ in queued))
+        for (_, future), reply in zip(queued, replies, strict=True):
+            if not future.done():
+                future.set_result(reply)
+        self._on_tick(self)
+
+    def _step(self, commands: tuple[cmd.Command, ...]) -> tuple[cmd.Reply, ...]:
+        now_s = self._clock.now_s()
+        dt_s, self.time_s = now_s - self.time_s, now_s
+        pose = self.pose(now_s)
+        self.faults = update_faults(self.faults, self._present_faults(now_s), now_s, CATALOGUE)
+        before = self.state
+        # The machine answers stop first; replies are put back into the order the commands came in.
+        order = sorted(range(len(commands)), key=lambda i: not isinstance(commands[i], cmd.Stop))
+        result = step(
+            self.state,
+            Inputs(
+                now_s=now_s,
+                resolve=lambda command, at: resolve(
+                    command, at, self.config.attitude, self.config.presets, self._limits()
+                ),
+                commands=commands,
+                observation=self._eyes.take_observation(),
+                pose=pose,
+                settled=self._settled(pose),
+                devices_active=self._power.all_active,
+                arm_error=self._power.take_error(),
+                unmet=tuple(r.unmet() for r in requirements(self, now_s) if r.mandatory and not r.met),
+                faults=self.faults.active,
+            ),
+            self.config.machine,
+            self.config.rule,
+        )
+        self.state, self.intents = result.state, result.intents
+        self._note_transition(before, result.state)
+        self._act(dt_s, pose)
+        replies: list[cmd.Reply] = [result.replies[0]] * len(commands) if commands else []
+        for position, index in enumerate(order):
+            replies[index] = result.replies[position]
+        return tuple(replies)
+
+    def _act(self, dt_s: float, pose: Pose) -> None:
+        """Pass the gate and hand what may be sent to the drivers."""
+        self._power.want(self.intents.power)
+        goals, shares = self._lift.step(self.intents.goals, pose)
+        self._gate, self.passed = pass_gate(
+            self._gate,
+            goals,
+            GateInputs(
+                settings=self.config.gate,
+                mode=self.state.mode,
+                pose=pose,
+                dt_s=dt_s,
+                lease_ok=self.state.mode is Mode.AUTO or self.state.lease is not None,
+                height_mm=self._lift.height_mm(pose),
+            ),
+        )
+        for axis, result in self.passed.items():
+            try:
+                self._send(axis, result.limited, shares.get(axis, 1.0))
+            except DeviceError as error:
+                # The driver is the last to say no (its own soft limits, a lost device); the axis holds.
+                self.passed[axis] = AxisPass(result.requested, None, str(error))
+                self._hold(axis)
+        if self._power.all_active and (angle := self.devices.rotation.telemetry().angle_deg) is not None:
+            self._eyes.send_angle(angle.value, angle.time_s)
+        elif (angle := self.devices.rotation.telemetry().angle_deg) is not None and angle.valid:
+            self._eyes.send_angle(angle.value, angle.time_s)
+
+    def _send(self, axis: str, limited: float | None, speed_share: float) -> None:
+        if limited is None or not self._power.all_active:
+            self._hold(axis)
+        elif axis == "rotation":
+            self._moving.add(axis)
+            self.devices.rotation.set_goal_deg(limited)
+        else:
+            self._moving.add(axis)
+            self.devices.actuators[axis].set_target_mm(limited, speed_share)
+
+    def _hold(self, axis: str) -> None:
+        """Once: a hold renewed every tick would follow every bit of measured drift."""
+        if axis in self._moving:
+            self._moving.discard(axis)
+            self.devices.all()[axis].hold()
+
+    # ---- what is known --------------------------------------------------------------------------------------------
+
+    def pose(self, now_s: float) -> Pose:
+        """Measured positions fresh enough to act on."""
+        control = self.config.control
+        positions = {
+            name: _fresh(self.devices.actuators[name].telemetry().position_mm, now_s, control.actuator_max_age_s)
+            for name in ACTUATOR_NAMES
+        }
+        return Pose(
+            rotation_deg=_fresh(self.devices.rotation.telemetry().angle_deg, now_s, control.rotation_max_age_s),
+            lift_left_mm=positions["lift_left"],
+            lift_right_mm=positions["lift_right"],
+            tilt_mm=positions["tilt"],
+        )
+
+    def _settled(self, pose: Pose) -> bool:
+        """Whether every axis with a goal stands at what the gate lets it have."""
+        for axis, result in self.passed.items():
+            if result.requested is None or result.limited is None:
+                continue
+            measured = pose.rotation_deg if axis == "rotation" else getattr(pose, f"{axis}_mm")
+            control = self.config.control
+            tolerance = control.rotation_tolerance_deg if axis == "rotation" else control.actuator_tolerance_mm
+            goal = result.requested if not result.reason else result.limited
+            if measured is None or abs(measured - goal) > tolerance:
+                return False
+        return True
+
+    def _limits(self) -> dict[str, tuple[float, float]]:
+        return {axis: (limit.low, limit.high) for axis, limit in self.config.gate.limits().items()}
+
+    def _present_faults(self, now_s: float) -> list[DeviceFault]:
+        found: list[DeviceFault] = [*self.devices.link.faults(), *self._eyes.faults()]
+        for device in self.devices.all().values():
+            found.extend(device.faults())
+        for source in self.extra_faults:
+            found.extend(source(now_s))
+        if self._late_since_s is not None and now_s - self._late_since_s < 1.0:
+            detail = f"tick {max(self.lateness_s) * 1e3:.0f} ms late, {self.overruns_n} overruns"
+            found.append(DeviceFault("daemon", "tick_overrun", detail, self._late_since_s))
+        if self._state_file.problem:
+            found.append(DeviceFault("daemon", "state_file_corrupt", self._state_file.problem, now_s))
+        return found
+
+    def _note_transition(self, before: State, after: State) -> None:
+        if before.mode is after.mode:
+            return
+        log.info("%s -> %s: %s", before.mode, after.mode, after.reason)
+        if after.mode is Mode.STOPPED:
+            self._hold_failed = self.devices.hold_all()
+            self._moving.clear()
+            self.last_stop = self._state_file.save(after.reason)
+        elif before.mode is Mode.STOPPED:
+            self.faults = clear_faults(self.faults, Clear.ON_RESET)
+        elif after.mode in ARMED and before.mode not in ARMED:
+            self.faults = clear_faults(self.faults, Clear.ON_REARM)
+            self._gate = GateState()
+
+    @property
+    def goals(self) -> Goals:
+        """What the machine asks for now."""
+        return self.intents.goals
+
+    def lifecycle(self, axis: str) -> Lifecycle:
+        """Lifecycle of an axis's device."""
+        return self.devices.all()[axis].lifecycle
+
+
+def _fresh(reading: Reading[float] | None, now_s: float, max_age_s: float) -> float | None:
+    return reading.value if reading is not None and reading.is_fresh(now_s, max_age_s) else None

@@ -1,0 +1,62 @@
+"""The devices the control loop works with, as contracts; built by ``graderd.runtime.app.devices``."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from graderd.hal.fault import DeviceFault
+from graderd.hal.linear_actuator import LinearActuator
+from graderd.hal.rotator import Rotator
+
+ACTUATOR_NAMES = ("lift_left", "lift_right", "tilt")
+
+
+class Link(Protocol):
+    """The CAN bus under the actuators: opened before them, closed after them."""
+
+    async def open(self) -> None:
+        """Open the channel and claim our address; afterwards it keeps itself open.
+
+        Raises:
+            DeviceMissingError: the channel does not exist.
+        """
+        ...
+
+    def faults(self) -> tuple[DeviceFault, ...]:
+        """Conditions of the bus present now."""
+        ...
+
+    async def close(self) -> None:
+        """Let go of the channel."""
+        ...
+
+
+Service = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Devices:
+    """Everything that can move, the bus under it, and services outside the control loop by name."""
+
+    rotation: Rotator
+    link: Link
+    actuators: dict[str, LinearActuator]
+    services: dict[str, Service] = field(default_factory=dict)
+    set_published_faults: Callable[[tuple[DeviceFault, ...]], None] = lambda faults: None
+    """Puts the daemon's faults on the bus as diagnostic messages (DM1)."""
+
+    def all(self) -> dict[str, Rotator | LinearActuator]:
+        """The axes by device name."""
+        return {"rotation": self.rotation, **self.actuators}
+
+    def hold_all(self) -> tuple[str, ...]:
+        """Ask every axis to stop where it is, each in its own try; returns the axes whose driver raised."""
+        failed = []
+        for name, device in self.all().items():
+            try:
+                device.hold()
+            except Exception:  # the stop path goes on to the next device whatever this one raised
+                failed.append(name)
+        return tuple(failed)
