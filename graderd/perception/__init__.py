@@ -1,0 +1,11 @@
+"""Perception: a frame and a blade angle in, a soil observation out. numpy and OpenCV, no device, no clock but CPU time.
+
+Four classifiers share one contract: ``paper`` (the letter of the paper's section 3.2), ``fast_color`` (the same rule on
+the blade's region), ``depth`` (litres per third above a ground fitted in every frame) and ``fused`` (depth decides,
+colour cross-checks; the default).
+"""
+
+from graderd.perception.classifier import Classifier, make_classifier
+from graderd.perception.settings import METHODS, CameraCalibration, Method, PerceptionSettings
+
+__all__ = ["METHODS", "CameraCalibration", "Classifier", "Method", "PerceptionSettings", "make_classifier"]

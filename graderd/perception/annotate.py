@@ -1,0 +1,105 @@
+"""Pictures for people: thirds on the blade, LEFT and RIGHT where the operator's are, numbers and the decision."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from graderd.core.blade import BladeGeometry
+from graderd.core.zones import SoilObservation, Zone
+from graderd.perception.geometry import CENTER, F64, LEFT, RIGHT, U8, View, third_outlines_px, top_edge_m
+from graderd.perception.settings import CameraCalibration
+
+Bgr = tuple[int, int, int]
+COLORS: dict[int, Bgr] = {LEFT: (80, 200, 80), CENTER: (230, 170, 60), RIGHT: (60, 120, 240)}
+NAMES = {LEFT: "LEFT", CENTER: "CENTER", RIGHT: "RIGHT"}
+ZONES = {LEFT: Zone.LEFT, CENTER: Zone.CENTER, RIGHT: Zone.RIGHT}
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+WHITE: Bgr = (255, 255, 255)
+DARK: Bgr = (30, 30, 30)
+
+
+def image_right_is_left(calibration: CameraCalibration | None) -> bool:
+    """Whether the picture's right is the operator's left: so for every camera that faces the blade from the front."""
+    return calibration is None or calibration.mounting == "facing_blade_from_front"
+
+
+def annotate(
+    image_bgr: U8, observation: SoilObservation, view: View | None, blade: BladeGeometry, mirrored: bool
+) -> U8:
+    """A copy of the picture with the observation drawn into it; without ``view`` the thirds are the picture's own."""
+    picture = image_bgr.copy()
+    height, width = picture.shape[:2]
+    scale = max(width / 1280, 0.35)
+    outlines = _outlines(view, blade, observation.blade_angle_deg, width, height, mirrored)
+    shade = picture.copy()
+    for third, outline in enumerate(outlines):
+        if np.isfinite(outline).all():
+            strong = observation.zone is ZONES[third] or observation.zone is Zone.EVEN
+            if strong:
+                cv2.fillPoly(shade, [np.round(outline).astype(np.int32)], COLORS[third])
+    picture = np.asarray(cv2.addWeighted(shade, 0.28, picture, 0.72, 0), dtype=np.uint8)
+    line = max(1, round(2 * scale))
+    for third, outline in enumerate(outlines):
+        if np.isfinite(outline).all():
+            cv2.polylines(picture, [np.round(outline).astype(np.int32)], True, COLORS[third], line, cv2.LINE_AA)
+    for third, outline in enumerate(outlines):
+        if np.isfinite(outline).all():
+            _label(picture, outline, third, observation, scale)
+    if view is not None:
+        edge = view.project(top_edge_m(blade, observation.blade_angle_deg))
+        if np.isfinite(edge).all():
+            cv2.polylines(picture, [np.round(edge).astype(np.int32)], False, WHITE, line, cv2.LINE_AA)
+    _banner(picture, observation, scale)
+    return picture
+
+
+def _outlines(
+    view: View | None, blade: BladeGeometry, angle_deg: float, width: int, height: int, mirrored: bool
+) -> tuple[F64, F64, F64]:
+    if view is not None:
+        return third_outlines_px(view, blade, angle_deg)
+    border = [0, width / 3, 2 * width / 3, width - 1]
+    strips = [np.array([[a, 0.0], [b, 0.0], [b, height - 1.0], [a, height - 1.0]]) for a, b in pairwise(border)]
+    if not mirrored:
+        strips.reverse()
+    return strips[0], strips[1], strips[2]
+
+
+def _label(picture: U8, outline: F64, third: int, observation: SoilObservation, scale: float) -> None:
+    share = observation.share_of(ZONES[third])
+    volume = {
+        LEFT: observation.volume_left_l,
+        CENTER: observation.volume_center_l,
+        RIGHT: observation.volume_right_l,
+    }[third]
+    below = f"{share * 100:.0f} %" + (f"  {volume:.1f} l" if volume is not None else "")
+    middle = np.clip(outline, (0, 0), (picture.shape[1] - 1, picture.shape[0] - 1)).mean(axis=0)
+    for row, text in enumerate((NAMES[third], below)):
+        size = scale * (0.9 if row == 0 else 0.7)
+        (w, h), _ = cv2.getTextSize(text, FONT, size, 2)
+        at = (int(middle[0] - w / 2), int(middle[1] + row * (h + 14 * scale)))
+        text_on(picture, text, at, size, COLORS[third])
+
+
+def text_on(picture: U8, text: str, at: tuple[int, int], size: float, color: Bgr = WHITE) -> None:
+    """Text with a dark rim, readable on any ground."""
+    thick = max(1, round(2 * size))
+    cv2.putText(picture, text, at, FONT, size, DARK, thick + max(2, round(3 * size)), cv2.LINE_AA)
+    cv2.putText(picture, text, at, FONT, size, color, thick, cv2.LINE_AA)
+
+
+def _banner(picture: U8, observation: SoilObservation, scale: float) -> None:
+    tall = round(74 * scale)
+    picture[:tall] = (picture[:tall] * 0.35).astype(np.uint8)
+    head = f"{observation.zone.upper()}  {observation.confidence * 100:.0f} %"
+    color = WHITE if observation.zone is not Zone.UNKNOWN else (80, 160, 255)
+    text_on(picture, head, (round(14 * scale), round(34 * scale)), 1.0 * scale, color)
+    tail = f"{observation.method}  blade {observation.blade_angle_deg:+.1f} deg  {observation.cpu_ms:.1f} ms"
+    (w, _), _ = cv2.getTextSize(tail, FONT, 0.7 * scale, 2)
+    text_on(picture, tail, (picture.shape[1] - w - round(14 * scale), round(32 * scale)), 0.7 * scale)
+    reason = observation.reason.replace("°", " deg").encode("ascii", "replace").decode()
+    most = int(picture.shape[1] / (9.8 * scale))
+    text_on(picture, reason[:most], (round(14 * scale), round(62 * scale)), 0.5 * scale)

@@ -1,0 +1,233 @@
+"""The four classifiers behind one contract: a frame and a blade angle in, one observation out."""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from graderd.core.blade import BladeGeometry
+from graderd.core.zones import PictureFault, SoilObservation, Zone
+from graderd.hal.camera import Frame, Intrinsics
+from graderd.perception import annotate as drawing
+from graderd.perception.color import fast_color_verdict, paper_verdict
+from graderd.perception.decide import Verdict
+from graderd.perception.depth import DepthJudge, HeightMap
+from graderd.perception.fused import fuse
+from graderd.perception.geometry import CENTER, LEFT, RIGHT, U8, Region, View, blade_region, image_thirds
+from graderd.perception.health import HealthMonitor
+from graderd.perception.settings import CameraCalibration, PerceptionSettings
+
+ANGLE_STEP_DEG = 0.25
+KEPT_REGIONS_N = 64
+
+
+class Classifier(Protocol):
+    """Says where the soil lies. Holds state (the frame before): one instance per stream of frames, one thread."""
+
+    def classify(self, frame: Frame, blade_angle_deg: float, blade_angle_age_s: float) -> SoilObservation:
+        """Judge one frame with the thirds laid at ``blade_angle_deg``, measured ``blade_angle_age_s`` before capture.
+
+        Never raises for what a picture shows: a bad picture gives zone UNKNOWN and names its faults.
+        """
+        ...
+
+    def annotate(self, frame: Frame, observation: SoilObservation) -> U8:
+        """The colour picture (BGR) with thirds, LEFT and RIGHT, numbers and decision drawn into it."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Regions:
+    """The blade's region of one picture size and angle, at full scale and at the fast scale."""
+
+    full: Region
+    fast: Region
+
+
+class SoilClassifier:
+    """The one implementation; ``settings.method`` chooses what it does with a healthy frame."""
+
+    def __init__(
+        self,
+        settings: PerceptionSettings,
+        calibration: CameraCalibration | None,
+        blade: BladeGeometry,
+        live: bool = True,
+    ) -> None:
+        self._settings = settings
+        self._calibration = calibration
+        self._blade = blade
+        self._health = HealthMonitor(settings.health, live)
+        self._views: dict[tuple[str, Intrinsics], View] = {}
+        self._judges: dict[Intrinsics, DepthJudge] = {}
+        self._regions: OrderedDict[tuple[object, ...], _Regions | None] = OrderedDict()
+
+    @property
+    def settings(self) -> PerceptionSettings:
+        """The settings it was made with."""
+        return self._settings
+
+    def classify(self, frame: Frame, blade_angle_deg: float, blade_angle_age_s: float) -> SoilObservation:
+        """See :class:`Classifier`."""
+        start_s = time.thread_time()
+        method = self._settings.method
+        faults = self._health.check(frame, needs_depth=method in ("depth", "fused"))
+        verdict = Verdict(Zone.UNKNOWN, 0.0, "")
+        if not faults:
+            verdict, more = self._judge(frame, blade_angle_deg)
+            faults += more
+        if faults:
+            verdict = verdict.unknown("; ".join(f"{fault.condition}: {fault.detail}" for fault in faults))
+        elif blade_angle_age_s > self._settings.decision.max_angle_age_s:
+            verdict = verdict.unknown(f"the blade angle was {blade_angle_age_s:.2f} s old at capture")
+        return self._observation(frame, verdict, blade_angle_deg, blade_angle_age_s, faults, start_s)
+
+    def annotate(self, frame: Frame, observation: SoilObservation) -> U8:
+        """See :class:`Classifier`."""
+        view = self.color_view(frame)
+        return drawing.annotate(
+            frame.color_bgr, observation, view, self._blade, drawing.image_right_is_left(self._calibration)
+        )
+
+    def color_view(self, frame: Frame) -> View | None:
+        """Lens and place of the colour stream for this frame; None without a calibration that applies."""
+        height, width = frame.color_bgr.shape[:2]
+        return self._view("color", frame.color_intrinsics, width, height)
+
+    def depth_view(self, frame: Frame) -> View | None:
+        """Lens and place of the depth stream for this frame; None without depth or calibration."""
+        if frame.depth_mm is None:
+            return None
+        height, width = frame.depth_mm.shape
+        return self._view("depth", frame.depth_intrinsics, width, height)
+
+    def height_map(self, frame: Frame, blade_angle_deg: float) -> HeightMap | None:
+        """The soil's height map of a frame, for pictures and studies; None where the frame or calibration has none."""
+        judge = self._depth_judge(frame)
+        if judge is None or frame.depth_mm is None:
+            return None
+        return judge.height_map(frame.depth_mm, blade_angle_deg)
+
+    def _view(self, stream: str, lens: Intrinsics | None, width: int, height: int) -> View | None:
+        if self._calibration is None:
+            return None
+        calibrated = self._calibration.color if stream == "color" else self._calibration.depth
+        if lens is None:
+            lens = calibrated.intrinsics()
+            if abs(lens.width * height - lens.height * width) > 0.02 * lens.width * height:
+                return None  # another aspect ratio is another read-out of the sensor: the lens data do not apply
+            lens = lens.scaled(width, height)
+        key = (stream, lens)
+        if key not in self._views:
+            self._views[key] = View(lens, calibrated.pose(self._calibration.mounting))
+        return self._views[key]
+
+    def _region(self, frame: Frame, angle_deg: float) -> _Regions | None:
+        height, width = frame.color_bgr.shape[:2]
+        view = self.color_view(frame)
+        step = round(angle_deg / ANGLE_STEP_DEG)
+        key = (width, height, view and view.lens, step if view else 0)
+        if key in self._regions:
+            self._regions.move_to_end(key)
+            return self._regions[key]
+        halvings = 2 if width >= 1000 else 1 if width >= 500 else 0
+        regions: _Regions | None = None
+        if view is None:
+            left = drawing.image_right_is_left(self._calibration)
+            regions = _Regions(image_thirds(width, height, 0, left), image_thirds(width, height, halvings, left))
+        else:
+            full = blade_region(view, self._blade, step * ANGLE_STEP_DEG, 0)
+            fast = blade_region(view, self._blade, step * ANGLE_STEP_DEG, halvings)
+            if full is not None and fast is not None:
+                regions = _Regions(full, fast)
+        self._regions[key] = regions
+        if len(self._regions) > KEPT_REGIONS_N:
+            self._regions.popitem(last=False)
+        return regions
+
+    def _depth_judge(self, frame: Frame) -> DepthJudge | None:
+        view = self.depth_view(frame)
+        if view is None:
+            return None
+        if view.lens not in self._judges:
+            self._judges[view.lens] = DepthJudge(view, self._blade, self._settings.depth, self._settings.decision)
+        return self._judges[view.lens]
+
+    def _judge(self, frame: Frame, angle_deg: float) -> tuple[Verdict, list[PictureFault]]:
+        settings = self._settings
+        regions = self._region(frame, angle_deg)
+        if regions is None:
+            return Verdict(Zone.UNKNOWN, 0.0, "the blade is not in the picture at this angle"), []
+        faults = self._health.blurred(frame.color_bgr, regions.full)
+        if faults:
+            return Verdict(Zone.UNKNOWN, 0.0, ""), faults
+        if settings.method == "paper":
+            return self._said(
+                frame, paper_verdict(frame.color_bgr, regions.full, settings.color, settings.decision)
+            ), []
+        if settings.method == "fast_color":
+            verdict = fast_color_verdict(frame.color_bgr, regions.fast, settings.color, settings.decision)
+            return self._said(frame, verdict), []
+        judge = self._depth_judge(frame)
+        if judge is None or frame.depth_mm is None:
+            return Verdict(Zone.UNKNOWN, 0.0, "no calibration of the depth picture applies"), []
+        soil = judge.height_map(frame.depth_mm, angle_deg)
+        by_depth = judge.verdict(soil)
+        faults = self._health.knocked(soil.ground, soil.blade, settings.depth)
+        if settings.method == "depth" or faults:
+            return by_depth, faults
+        by_color = fast_color_verdict(frame.color_bgr, regions.fast, settings.color, settings.decision)
+        return fuse(by_depth, by_color), []
+
+    def _said(self, frame: Frame, verdict: Verdict) -> Verdict:
+        if self.color_view(frame) is not None:
+            return verdict
+        side = "right" if drawing.image_right_is_left(self._calibration) else "left"
+        note = f"thirds of the whole picture, its {side} taken as the operator's left (no calibration applies)"
+        return Verdict(
+            verdict.zone, 0.5 * verdict.confidence, f"{verdict.reason}; {note}", verdict.shares, verdict.volumes_l
+        )
+
+    def _observation(
+        self,
+        frame: Frame,
+        verdict: Verdict,
+        angle_deg: float,
+        angle_age_s: float,
+        faults: list[PictureFault],
+        start_s: float,
+    ) -> SoilObservation:
+        volumes = verdict.volumes_l
+        return SoilObservation(
+            capture_s=frame.capture_s,
+            zone=verdict.zone,
+            confidence=float(np.clip(verdict.confidence, 0.0, 1.0)),
+            reason=verdict.reason,
+            share_left=verdict.shares[LEFT],
+            share_center=verdict.shares[CENTER],
+            share_right=verdict.shares[RIGHT],
+            volume_left_l=volumes[LEFT] if volumes else None,
+            volume_center_l=volumes[CENTER] if volumes else None,
+            volume_right_l=volumes[RIGHT] if volumes else None,
+            blade_angle_deg=angle_deg,
+            blade_angle_age_s=angle_age_s,
+            frame_number=frame.color_number,
+            method=self._settings.method,
+            cpu_ms=(time.thread_time() - start_s) * 1000.0,
+            faults=tuple(faults),
+        )
+
+
+def make_classifier(
+    settings: PerceptionSettings, calibration: CameraCalibration | None, blade: BladeGeometry, live: bool = True
+) -> Classifier:
+    """A classifier for one stream of frames.
+
+    ``calibration`` None: thirds of the whole picture (colour methods only). ``live`` False: the frames are stills, so
+    equal pictures and changing sizes are no fault.
+    """
+    return SoilClassifier(settings, calibration, blade, live)

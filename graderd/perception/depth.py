@@ -1,0 +1,145 @@
+"""Soil by its height: how many litres lie in front of each third of the blade, from the depth picture alone.
+
+Colour, light, wetness and rust do not enter. One frame: every n-th pixel becomes a point in the vehicle frame; ground
+and blade are found again (:mod:`graderd.perception.registration`); points in front of the face fill a height map
+in blade coordinates; what the crest hides from the camera is filled with a slope at the angle of repose; heights above
+the noise add up to litres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graderd.core.blade import BladeGeometry
+from graderd.hal.camera import DepthImage
+from graderd.perception.decide import Verdict, decide
+from graderd.perception.geometry import F32, F64, View
+from graderd.perception.registration import BladeFinder, BladeFix, Ground, GroundFit
+from graderd.perception.settings import DecisionSettings, DepthSettings
+
+MAX_SOIL_M = 0.45
+"""What stands higher than this above the ground is machine, not soil."""
+FACE_MARGIN_M = 0.025
+"""Points closer to the blade's face than this are the face."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeightMap:
+    """Soil in blade coordinates: ``height_m[i, j]`` at s cell i (right to left) and d cell j (blade to front).
+
+    ``seen`` is False where the height was filled in. ``valid``: share of cells seen per third (right, center, left).
+    """
+
+    height_m: F64
+    seen: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+    threshold_m: float
+    volumes_l: tuple[float, float, float]
+    valid: tuple[float, float, float]
+    ground: Ground
+    blade: BladeFix
+
+
+class DepthJudge:
+    """Turns depth pictures of one stream into litres per third."""
+
+    def __init__(self, view: View, blade: BladeGeometry, settings: DepthSettings, decision: DecisionSettings) -> None:
+        self._settings = settings
+        self._decision = decision
+        self._blade = blade
+        self._position = view.position_m.astype(np.float32)
+        rays = view.rays(settings.stride_px)
+        self._rays = tuple(np.ascontiguousarray(rays[..., axis]).ravel() for axis in range(3))
+        self._focal_px = view.lens.fx
+        self._ground = GroundFit(settings.ground_offset_limit_m, settings.ground_slope_limit_deg)
+        self._finder = BladeFinder(blade)
+        self._along_n = max(6, 3 * round(blade.length_m / settings.cell_m / 3))
+        self._ahead_n = max(4, round(blade.reach_m / settings.cell_m))
+        self._cell_s_m = blade.length_m / self._along_n
+        self._cell_d_m = blade.reach_m / self._ahead_n
+
+    def height_map(self, depth_mm: DepthImage, angle_deg: float) -> HeightMap:
+        """Measure one depth picture (uint16, mm along the optical axis, 0 = no value)."""
+        x, y, z = self._points(depth_mm)
+        ground = self._ground.fit(x, y, z)
+        z = np.asarray(
+            z - np.float32(ground.offset_m) - np.float32(ground.slope_x) * x - np.float32(ground.slope_y) * y
+        )
+        angle = np.radians(angle_deg)
+        cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+        d = x * cos + y * sin - np.float32(self._blade.x_offset_m)
+        near = np.flatnonzero((d > -0.20) & (d < self._blade.reach_m + 0.15) & (z < MAX_SOIL_M))
+        x, y, z, d = x[near], y[near], z[near], d[near]
+        s = y * cos - x * sin
+        setback = self._finder.setback(z)
+        fix = self._finder.find(s, d, z, setback)
+        # Small rotation and shift of the blade against its calibrated place.
+        turn = np.float32(np.radians(fix.turn_deg))
+        ahead, along = np.float32(fix.ahead_m), np.float32(fix.along_m)
+        d = np.asarray(d - ahead + turn * s, dtype=np.float32)
+        s = np.asarray(s - along - turn * d, dtype=np.float32)
+        return self._map(s, d, z, setback, ground, fix)
+
+    def verdict(self, soil: HeightMap) -> Verdict:
+        """Judge a height map."""
+        settings = self._settings
+        verdict = decide(soil.volumes_l, settings.none_volume_l, "l", self._decision, soil.volumes_l)
+        weakest = min(soil.valid)
+        if weakest * 100 < settings.min_valid_percent:
+            return verdict.unknown(
+                f"only {weakest * 100:.0f} % of a third has depth, {settings.min_valid_percent:.0f} % is asked"
+            )
+        return verdict
+
+    def _points(self, depth_mm: DepthImage) -> tuple[F32, F32, F32]:
+        stride = self._settings.stride_px
+        depth = depth_mm[stride // 2 :: stride, stride // 2 :: stride].ravel()
+        valid = np.flatnonzero(depth)
+        range_m = depth[valid].astype(np.float32) * np.float32(0.001)
+        x, y, z = (ray[valid] * range_m + origin for ray, origin in zip(self._rays, self._position, strict=True))
+        return x, y, z
+
+    def _map(self, s: F32, d: F32, z: F32, setback: F32, ground: Ground, fix: BladeFix) -> HeightMap:
+        blade, settings = self._blade, self._settings
+        half = np.float32(blade.length_m / 2)
+        front = d > np.maximum(np.float32(FACE_MARGIN_M) - setback, np.float32(0.0))
+        inside = np.flatnonzero(front & (d < blade.reach_m) & (np.abs(s) < half))
+        s, d, z = s[inside], d[inside], z[inside]
+        i = np.minimum(((s + half) * np.float32(1 / self._cell_s_m)).astype(np.int32), self._along_n - 1)
+        j = np.minimum((d * np.float32(1 / self._cell_d_m)).astype(np.int32), self._ahead_n - 1)
+        flat = i * self._ahead_n + j
+        size = self._along_n * self._ahead_n
+        count = np.bincount(flat, minlength=size)
+        total = np.bincount(flat, weights=z, minlength=size)
+        seen = (count > 0).reshape(self._along_n, self._ahead_n)
+        height = np.divide(total, count, out=np.zeros(size), where=count > 0).reshape(seen.shape)
+        filled = fill_hidden(height, seen, float(np.tan(np.radians(settings.repose_deg))) * self._cell_d_m)
+        distance = 0.9
+        expected = settings.disparity_noise_px * distance**2 / (self._focal_px * settings.baseline_m)
+        noise = max(expected, ground.residual_m)
+        threshold = max(settings.min_height_m, settings.noise_factor_ratio * noise / 2.0)
+        soil = np.where(filled > threshold, filled, 0.0)
+        litres = soil.reshape(3, -1).sum(axis=1) * self._cell_s_m * self._cell_d_m * 1000.0
+        valid = seen.reshape(3, -1).mean(axis=1)
+        return HeightMap(
+            filled,
+            seen,
+            threshold,
+            (float(litres[0]), float(litres[1]), float(litres[2])),
+            (float(valid[0]), float(valid[1]), float(valid[2])),
+            ground,
+            fix,
+        )
+
+
+def fill_hidden(height: F64, seen: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], drop_per_cell: float) -> F64:
+    """Heights with the unseen cells filled along d: from both sides, falling by ``drop_per_cell`` each cell."""
+    ahead, back = height.copy(), height.copy()
+    last = height.shape[1] - 1
+    unseen = ~seen
+    for j in range(last - 1, -1, -1):
+        np.maximum(ahead[:, j + 1] - drop_per_cell, 0.0, out=ahead[:, j], where=unseen[:, j])
+    for j in range(1, last + 1):
+        np.maximum(back[:, j - 1] - drop_per_cell, 0.0, out=back[:, j], where=unseen[:, j])
+    return np.where(seen, height, np.maximum(ahead, back))

@@ -1,0 +1,170 @@
+"""Is this picture fit to be judged? Every check is cheap and names what it found; none of them guesses a zone.
+
+Checks of one frame by itself: wrong resolution, black, blown out, blocked, blurred, torn, no depth. Checks that
+remember the frame before: frozen, a resolution that changes in mid-stream. Whether the camera was knocked out of place
+comes out of the registration (:mod:`graderd.perception.registration`) and is judged here.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from graderd.core.zones import PictureFault
+from graderd.hal.camera import Frame
+from graderd.perception.geometry import U8, Region
+from graderd.perception.registration import BladeFix, Ground
+from graderd.perception.settings import DepthSettings, HealthSettings
+
+SAMPLE_STEP_PX = 8
+TILE_PX = 5
+FLAT_GRAY = 1.6
+"""Standard deviation (grey levels) within a tile of the smoothed sample below which it shows nothing."""
+CLIPPED_GRAY = 250
+BLUR_REACH_PX = 8
+GROUND_AT_M = (0.2, 0.0)
+"""Where the ground's level is compared: before the blade."""
+
+
+class HealthMonitor:
+    """Judges pictures one after the other; one instance per stream of frames."""
+
+    def __init__(self, settings: HealthSettings, live: bool) -> None:
+        self._settings = settings
+        self._live = live
+        self._last_sample: bytes = b""
+        self._last_size: tuple[int, ...] = ()
+        self._same_n = 0
+
+    def check(self, frame: Frame, needs_depth: bool) -> list[PictureFault]:
+        """What is wrong with the picture as such, before anything is measured in it."""
+        faults = self._size(frame)
+        sample = np.ascontiguousarray(frame.color_bgr[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX])
+        faults += self._light(sample)
+        faults += self._frozen(frame, sample)
+        faults += self._torn(frame)
+        if needs_depth:
+            faults += self._depth(frame)
+        return faults
+
+    def _size(self, frame: Frame) -> list[PictureFault]:
+        height, width = frame.color_bgr.shape[:2]
+        size: tuple[int, ...] = (width, height)
+        if frame.depth_mm is not None:
+            size += (frame.depth_mm.shape[1], frame.depth_mm.shape[0])
+        changed = self._live and self._last_size and self._last_size[: len(size)] != size[: len(self._last_size)]
+        if not changed:
+            self._last_size = max(size, self._last_size, key=len)
+        faults = []
+        for what, lens, shape in (
+            ("colour", frame.color_intrinsics, (width, height)),
+            ("depth", frame.depth_intrinsics, size[2:]),
+        ):
+            if lens is not None and shape and (lens.width, lens.height) != shape:
+                detail = f"{what} picture is {shape[0]}x{shape[1]}, its lens data are for {lens.width}x{lens.height}"
+                faults.append(PictureFault("wrong_resolution", detail))
+        if changed and not faults:
+            before = "x".join(str(side) for side in self._last_size[:2])
+            detail = f"colour picture is {width}x{height}, the stream began with {before}"
+            faults.append(PictureFault("wrong_resolution", detail))
+        return faults
+
+    def _light(self, sample: U8) -> list[PictureFault]:
+        settings = self._settings
+        gray = cv2.cvtColor(sample, cv2.COLOR_BGR2GRAY)
+        mean_percent = float(gray.mean()) / 2.55
+        if mean_percent < settings.black_percent:
+            return [
+                PictureFault("black", f"mean brightness {mean_percent:.1f} %, at least {settings.black_percent:g} %")
+            ]
+        clipped = 100.0 * float((gray >= CLIPPED_GRAY).mean())
+        if clipped > settings.blown_out_percent:
+            return [PictureFault("blown_out", f"{clipped:.0f} % of the pixels are clipped")]
+        flat = 100.0 * flat_share(np.asarray(gray, dtype=np.uint8))
+        if flat > settings.blocked_flat_percent:
+            return [PictureFault("blocked", f"{flat:.0f} % of the picture shows no texture: something covers the lens")]
+        return []
+
+    def _frozen(self, frame: Frame, sample: U8) -> list[PictureFault]:
+        if self._settings.frozen_frames_n == 0 or not self._live:
+            return []
+        mark = sample.tobytes()
+        if frame.depth_mm is not None:
+            mark += frame.depth_mm[::16, ::16].tobytes()
+        self._same_n = self._same_n + 1 if mark == self._last_sample else 0
+        self._last_sample = mark
+        if self._same_n >= self._settings.frozen_frames_n:
+            return [PictureFault("frozen", f"the same picture {self._same_n + 1} times in a row")]
+        return []
+
+    def _torn(self, frame: Frame) -> list[PictureFault]:
+        if frame.depth_mm is None:
+            return []
+        color_s, depth_s = frame.metadata.get("color_device_s"), frame.metadata.get("depth_device_s")
+        if color_s is not None and depth_s is not None:
+            apart_s = abs(color_s - depth_s)
+            if apart_s > self._settings.torn_s:
+                return [PictureFault("torn", f"colour and depth were taken {apart_s * 1000:.0f} ms apart")]
+            return []
+        if frame.color_number >= 0 and frame.depth_number >= 0 and frame.color_number != frame.depth_number:
+            detail = f"colour is frame {frame.color_number}, depth is frame {frame.depth_number}"
+            return [PictureFault("torn", detail)]
+        return []
+
+    def _depth(self, frame: Frame) -> list[PictureFault]:
+        if frame.depth_mm is None:
+            return [PictureFault("depth_missing", "the frame has no depth picture")]
+        valid = 100.0 * float(np.count_nonzero(frame.depth_mm[::8, ::8])) / frame.depth_mm[::8, ::8].size
+        if valid < self._settings.depth_valid_percent:
+            return [PictureFault("depth_missing", f"only {valid:.0f} % of the picture has depth")]
+        return []
+
+    def blurred(self, image_bgr: U8, region: Region) -> list[PictureFault]:
+        """Fine against coarse contrast on rows of the blade's region: a blurred picture has only coarse contrast."""
+        ratio = sharpness_ratio(image_bgr, region)
+        if ratio < self._settings.blurred_ratio:
+            detail = f"fine contrast is {ratio:.2f} of the coarse, at least {self._settings.blurred_ratio:.2f}"
+            return [PictureFault("blurred", detail)]
+        return []
+
+    def knocked(self, ground: Ground, blade: BladeFix, depth: DepthSettings) -> list[PictureFault]:
+        """Whether ground and blade were found so far from the calibration that the camera must have been moved."""
+        reasons = []
+        offset_m = ground.offset_under_m(*GROUND_AT_M)
+        if abs(offset_m) > depth.ground_offset_limit_m:
+            reasons.append(f"ground {offset_m * 1000:+.0f} mm off")
+        if ground.slope_deg() > depth.ground_slope_limit_deg:
+            reasons.append(f"ground tilted by {ground.slope_deg():.1f} deg")
+        if max(abs(blade.ahead_m), abs(blade.along_m)) > self._settings.knocked_mm / 1000:
+            reasons.append(f"blade {blade.ahead_m * 1000:+.0f} mm ahead, {blade.along_m * 1000:+.0f} mm along")
+        if abs(blade.turn_deg) > self._settings.knocked_deg:
+            reasons.append(f"blade turned by {blade.turn_deg:+.1f} deg")
+        if blade.missing * 100 > self._settings.knocked_missing_percent:
+            reasons.append(f"{blade.missing * 100:.0f} % of the blade is not where it should be")
+        return [PictureFault("knocked", ", ".join(reasons) + " against the calibration")] if reasons else []
+
+
+def flat_share(gray: U8) -> float:
+    """Share of tiles in which the smoothed picture hardly varies."""
+    smooth = cv2.blur(gray, (3, 3)).astype(np.float32)
+    rows, columns = (side // TILE_PX for side in smooth.shape)
+    tiles = smooth[: rows * TILE_PX, : columns * TILE_PX].reshape(rows, TILE_PX, columns, TILE_PX)
+    return float((tiles.std(axis=(1, 3)) < FLAT_GRAY).mean())
+
+
+def sharpness_ratio(image_bgr: U8, region: Region) -> float:
+    """Mean difference of pixels 2 apart over that of pixels 16 apart, along sampled rows of the region, green channel.
+
+    Pairs of rows are averaged, which takes out part of the sensor's noise. A sharp picture of soil has about 0.5, a
+    linear ramp 0.125.
+    """
+    band = image_bgr[region.rows, region.columns, 1]
+    step = max(2, band.shape[0] // 24)
+    usable = band.shape[0] // step * step
+    if usable == 0 or band.shape[1] < 4 * BLUR_REACH_PX:
+        return 1.0
+    lines = band[:usable:step].astype(np.float32) + band[1:usable:step].astype(np.float32)
+    fine = float(np.abs(lines[:, 2:] - lines[:, :-2]).mean())
+    reach = 2 * BLUR_REACH_PX
+    coarse = float(np.abs(lines[:, reach:] - lines[:, :-reach]).mean())
+    return fine / coarse if coarse > 1.0 else 1.0

@@ -1,0 +1,197 @@
+"""Where the camera really is, from this one depth picture: the ground's level and slope, and the blade's own place.
+
+The calibrated pose is never exact: mounts bend, tyres give, the machine pitches. Soil two centimetres high cannot
+be told from a camera two centimetres off, unless level and slope of the ground are fitted anew in every frame; and a
+third is not where the calibration says unless the blade's face and ends are found again. What is found also tells when
+the camera was knocked out of place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graderd.core.blade import BladeGeometry
+from graderd.perception.geometry import F32, F64, face_setback_m
+
+GROUND_CELL_M = 0.08
+GROUND_BAND_M = 0.13
+"""Points this close to the calibrated ground may be ground."""
+GROUND_EXTENT_M = (-2.0, 1.2, -1.2, 1.2)
+"""x from, x to, y from, y to (vehicle frame) of what is looked at."""
+CELL_FLAT_M = 0.010
+"""Heights within a cell of ground spread less than this; the side of a pile spreads more."""
+INLIER_M = 0.010
+HYPOTHESES_N = 96
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """Plane ``z = offset_m + slope_x * x + slope_y * y`` in the calibrated vehicle frame.
+
+    ``residual_m``: robust rms of the heights about it. ``support``: share of the flat cells that lie on it.
+    ``cells``: how many cells those are; 0 where no ground was seen and the calibration is kept.
+    """
+
+    offset_m: float = 0.0
+    slope_x: float = 0.0
+    slope_y: float = 0.0
+    residual_m: float = 0.0
+    support: float = 0.0
+    cells: int = 0
+
+    def slope_deg(self) -> float:
+        """Angle between this plane and the calibrated ground."""
+        return float(np.degrees(np.hypot(self.slope_x, self.slope_y)))
+
+    def offset_under_m(self, x_m: float, y_m: float) -> float:
+        """Height of the plane at a place."""
+        return self.offset_m + self.slope_x * x_m + self.slope_y * y_m
+
+
+class GroundFit:
+    """Fits the ground: flat cells vote on planes, soil above does no harm, soil below does not exist."""
+
+    def __init__(self, offset_limit_m: float, slope_limit_deg: float) -> None:
+        self._offset_limit_m = offset_limit_m
+        self._slope_limit = float(np.tan(np.radians(slope_limit_deg)))
+        # Fixed draws: the same picture always gives the same plane.
+        self._draws = np.random.default_rng(1).random((HYPOTHESES_N, 3))
+        x0, x1, y0, y1 = GROUND_EXTENT_M
+        self._columns = round((y1 - y0) / GROUND_CELL_M)
+        self._rows = round((x1 - x0) / GROUND_CELL_M)
+
+    def fit(self, x: F32, y: F32, z: F32) -> Ground:
+        """Plane through the ground points among ``x, y, z`` (vehicle frame, m)."""
+        cx, cy, cz, noise = self._flat_cells(x, y, z)
+        if cx.size < 6:
+            return Ground()
+        a = np.column_stack((np.ones_like(cx), cx, cy))
+        plane = self._vote(a, cz)
+        for width in (2.0 * INLIER_M, INLIER_M):
+            near = np.abs(cz - a @ plane) < width
+            if near.sum() < 6:
+                return Ground()
+            # A weak pull towards the calibration keeps slopes sane where ground is seen on one side only.
+            pull = np.diag((0.0, 0.05, 0.05))
+            plane = np.asarray(np.linalg.solve(a[near].T @ a[near] + pull, a[near].T @ cz[near]), dtype=np.float64)
+        near = np.abs(cz - a @ plane) < INLIER_M
+        return Ground(
+            float(plane[0]),
+            float(plane[1]),
+            float(plane[2]),
+            float(np.median(noise[near])) if near.any() else 0.0,
+            float(near.mean()),
+            int(near.sum()),
+        )
+
+    def _flat_cells(self, x: F32, y: F32, z: F32) -> tuple[F64, F64, F64, F64]:
+        x0, x1, y0, y1 = GROUND_EXTENT_M
+        take = np.flatnonzero((np.abs(z) < GROUND_BAND_M) & (x > x0) & (x < x1) & (np.abs(y) < y1))
+        x, y, z = x[take], y[take], z[take]
+        cell = ((x - np.float32(x0)) * np.float32(1 / GROUND_CELL_M)).astype(np.int32) * self._columns
+        cell += ((y - np.float32(y0)) * np.float32(1 / GROUND_CELL_M)).astype(np.int32)
+        size = self._rows * self._columns
+        count = np.bincount(cell, minlength=size)[:size]
+        full = np.flatnonzero(count >= 5)
+        n = count[full].astype(np.float64)
+        sums = [np.bincount(cell, weights=w, minlength=size)[full] / n for w in (x, y, z)]
+        spread = np.sqrt(np.maximum(np.bincount(cell, weights=z * z, minlength=size)[full] / n - sums[2] ** 2, 0.0))
+        flat = spread < CELL_FLAT_M
+        return sums[0][flat], sums[1][flat], sums[2][flat], spread[flat]
+
+    def _vote(self, a: F64, z: F64) -> F64:
+        count = z.size
+        picks = np.minimum((self._draws * count).astype(np.intp), count - 1)
+        with np.errstate(all="ignore"):
+            p0, p1, p2 = (np.column_stack((a[picks[:, i], 1:], z[picks[:, i]])) for i in range(3))
+            normal = np.cross(p1 - p0, p2 - p0)
+            good = np.abs(normal[:, 2]) > 0.01
+            up = np.where(good, normal[:, 2], 1.0)
+            slope_x, slope_y = -normal[:, 0] / up, -normal[:, 1] / up
+            offset = p0[:, 2] - slope_x * p0[:, 0] - slope_y * p0[:, 1]
+        good &= np.hypot(slope_x, slope_y) < 1.5 * self._slope_limit
+        good &= np.abs(offset) < 1.5 * self._offset_limit_m
+        planes = np.vstack((np.zeros((1, 3)), np.column_stack((offset, slope_x, slope_y))[good]))
+        residual = z[None, :] - planes @ a.T
+        inlier = np.maximum(0.0, 1.0 - (residual / INLIER_M) ** 2).sum(axis=1)
+        # Nothing lies under the ground: cells below a plane speak against it.
+        below = (residual < -2.0 * INLIER_M).sum(axis=1)
+        prior = (planes[:, 0] / self._offset_limit_m) ** 2 + (
+            np.hypot(planes[:, 1], planes[:, 2]) / self._slope_limit
+        ) ** 2
+        score = inlier - 1.5 * below - 0.05 * count * prior
+        return np.asarray(planes[int(np.argmax(score))], dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class BladeFix:
+    """Where the blade was found, relative to the calibrated place at the measured angle.
+
+    ``ahead_m`` along d, ``along_m`` along s, ``turn_deg`` counter-clockwise; each 0 where it could not be seen.
+    ``seen``: share of the pixels on the calibrated face that show the face. ``missing``: share of them that see
+    through to what lies behind, where a blade should be.
+    """
+
+    ahead_m: float = 0.0
+    along_m: float = 0.0
+    turn_deg: float = 0.0
+    seen: float = 0.0
+    missing: float = 0.0
+
+
+class BladeFinder:
+    """Finds the moldboard's face and ends in the points, given roughly where they are."""
+
+    SEARCH_M = 0.09
+    COLUMNS_N = 12
+
+    def __init__(self, blade: BladeGeometry) -> None:
+        self._blade = blade
+        table = np.linspace(-0.2, 0.8, 1001)
+        self._setback = face_setback_m(blade, table).astype(np.float32)
+
+    def setback(self, z: F32) -> F32:
+        """Set-back of the hollow face at heights ``z`` (table look-up, 1 mm)."""
+        index = np.clip((z + np.float32(0.2)) * np.float32(1000.0), 0, 1000).astype(np.int32)
+        return np.asarray(self._setback[index], dtype=np.float32)
+
+    def find(self, s: F32, d: F32, z: F32, setback: F32) -> BladeFix:
+        """``s, d, z``: points in blade coordinates, level ground at z = 0; ``setback`` that of their heights."""
+        blade = self._blade
+        half = blade.length_m / 2
+        top = blade.bottom_z_m + blade.height_m
+        face = d + setback  # 0 on the face
+        upper = (z > top - 0.16) & (z < top - 0.01) & (np.abs(s) < half + self.SEARCH_M)
+        near = np.flatnonzero(upper & (np.abs(face) < self.SEARCH_M))
+        if near.size < 40:
+            return BladeFix()
+        near_s, near_face = s[near], face[near]
+        column = ((near_s + np.float32(half)) * np.float32(self.COLUMNS_N / blade.length_m)).astype(np.int32)
+        at, medians = [], []
+        for i in range(self.COLUMNS_N):
+            inside = near_face[column == i]
+            if inside.size >= 8:
+                # The face is the rearmost surface: soil and hoses lie ahead of it.
+                at.append((i + 0.5) / self.COLUMNS_N * blade.length_m - half)
+                medians.append(float(np.percentile(inside, 35)))
+        if len(at) < 4:
+            return BladeFix()
+        s_at, face_at = np.asarray(at), np.asarray(medians)
+        first, second = np.triu_indices(len(at), 3)
+        slopes = (face_at[second] - face_at[first]) / (s_at[second] - s_at[first])
+        slope = float(np.median(slopes)) if slopes.size else 0.0
+        ahead = float(np.median(face_at - slope * s_at))
+        on_face = np.abs(near_face - np.float32(ahead) - np.float32(slope) * near_s) < 0.015
+        along = self._ends(near_s[on_face])
+        return BladeFix(ahead, along, -float(np.degrees(np.arctan(slope))), float(on_face.mean()), 0.0)
+
+    def _ends(self, s: F32) -> float:
+        if s.size < 60:
+            return 0.0
+        low, high = np.percentile(s, (0.7, 99.3))
+        length = self._blade.length_m
+        if abs((high - low) - length) > 0.05:
+            return 0.0  # an end is hidden; the middle of what is seen says nothing
+        return float(low + high) / 2

@@ -1,0 +1,298 @@
+"""Settings of perception: how a picture is judged, and where the camera sits.
+
+Both are sections of the configuration file. Every number carries its unit in its name.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from graderd.core.blade import BladeGeometry
+from graderd.hal.camera import Intrinsics, StreamPose
+from graderd.hal.settings import Finite, NotNegative, Positive, Settings
+
+Method = Literal["paper", "fast_color", "depth", "fused"]
+METHODS: tuple[Method, ...] = ("paper", "fast_color", "depth", "fused")
+
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Percent = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
+HueDegrees = Annotated[float, Field(ge=0, le=360, allow_inf_nan=False)]
+HueHalfDegrees = Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)]
+
+
+class ColorSettings(Settings):
+    """The colour rule of the paper (section 3.2) and of its fast form.
+
+    The paper gives the hue window as 0 to 12 without a unit, next to saturation and value in percent. Exactly one of
+    the three readings is set; only the reading in percent (0 to 43 degrees) holds brown soil.
+    """
+
+    hue_window_percent: tuple[Percent, Percent] | None = Field(
+        default=(0.0, 12.0), description="percent of the full circle"
+    )
+    hue_window_deg: tuple[HueDegrees, HueDegrees] | None = Field(
+        default=None, description="degrees of the colour circle"
+    )
+    hue_window_half_deg: tuple[HueHalfDegrees, HueHalfDegrees] | None = Field(
+        default=None, description="OpenCV's own 0 to 180"
+    )
+    saturation_window_percent: tuple[Percent, Percent] = (0.0, 100.0)
+    value_window_percent: tuple[Percent, Percent] = (0.0, 100.0)
+    brightness_target_percent: Percent = Field(default=45.0, description="mean brightness the picture is scaled to")
+    brightness_gain_max_ratio: Positive = Field(default=2.0, description="the picture is scaled by no more than this")
+    bilateral_diameter_px: int = Field(default=9, ge=3, le=25)
+    bilateral_sigma_n: Positive = Field(default=75.0, description="grey levels and pixels that count as near")
+    contour_tolerance_percent: NotNegative = Field(
+        default=0.5, description="of the contour's length, for the approximation"
+    )
+    none_area_percent: Percent = Field(default=6.0, description="soil on less of the blade's region than this: none")
+
+    @model_validator(mode="after")
+    def _one_reading(self) -> ColorSettings:
+        readings = (self.hue_window_percent, self.hue_window_deg, self.hue_window_half_deg)
+        if sum(reading is not None for reading in readings) != 1:
+            raise ValueError(
+                "set exactly one of hue_window_percent, hue_window_deg and hue_window_half_deg, and the others to none"
+            )
+        for window in (*readings, self.saturation_window_percent, self.value_window_percent):
+            if window is not None and window[0] > window[1]:
+                raise ValueError(f"a window runs from low to high, not from {window[0]} to {window[1]}")
+        return self
+
+    def opencv_window(self) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
+        """Lower and upper bound for ``cv2.inRange`` on an 8-bit HSV picture (H 0-180, S and V 0-255), inclusive."""
+        if self.hue_window_percent is not None:
+            hue = tuple(share * 1.8 for share in self.hue_window_percent)
+        elif self.hue_window_deg is not None:
+            hue = tuple(angle / 2.0 for angle in self.hue_window_deg)
+        else:
+            assert self.hue_window_half_deg is not None  # the validator's word
+            hue = self.hue_window_half_deg
+        sat = [share * 2.55 for share in self.saturation_window_percent]
+        val = [share * 2.55 for share in self.value_window_percent]
+        low = (math.ceil(hue[0]), math.ceil(sat[0]), math.ceil(val[0]))
+        high = (math.floor(hue[1]), math.floor(sat[1] + 1e-9), math.floor(val[1] + 1e-9))
+        return low, high
+
+
+class DepthSettings(Settings):
+    """The depth rule: soil height above a ground that is fitted anew in every frame."""
+
+    stride_px: int = Field(default=4, ge=1, le=16, description="every n-th row and column of the depth picture is used")
+    cell_m: Positive = Field(default=0.02, le=0.1, description="size of a cell of the height map in blade coordinates")
+    baseline_m: Positive = Field(default=0.095, description="stereo baseline of the D455, for the expected noise")
+    disparity_noise_px: Positive = Field(default=0.08, description="rms disparity error of the D455 family")
+    noise_factor_ratio: Positive = Field(
+        default=4.0, description="soil must stand this many times above the measured noise"
+    )
+    min_height_m: Positive = Field(default=0.012, description="and at least this high")
+    repose_deg: Annotated[float, Field(gt=0, lt=80)] = Field(
+        default=33.0, description="slope given to hidden back faces"
+    )
+    ground_offset_limit_m: Positive = Field(
+        default=0.06, description="fitted ground further off the calibrated one: knocked"
+    )
+    ground_slope_limit_deg: Positive = Field(default=4.5, description="fitted ground tilted more than this: knocked")
+    min_valid_percent: Percent = Field(default=35.0, description="less depth than this in front of the blade: unknown")
+    none_volume_l: Positive = Field(default=1.2, description="less soil than this in front of the whole blade: none")
+
+
+class DecisionSettings(Settings):
+    """From shares per third to a zone; the same for all methods."""
+
+    margin_ratio: Annotated[float, Field(ge=1)] = Field(
+        default=1.25, description="the fullest third leads by at least this"
+    )
+    even_share_min_percent: Percent = Field(default=20.0, description="even: no third holds less of the soil than this")
+    even_share_max_percent: Percent = Field(default=48.0, description="even: no third holds more of the soil than this")
+    max_angle_age_s: Positive = Field(default=0.25, description="a blade angle older than this at capture: unknown")
+
+
+class HealthSettings(Settings):
+    """When a picture is not to be trusted. A fault is named, and the zone is unknown while it lasts."""
+
+    black_percent: Percent = Field(default=6.0, description="brightness below which a picture is black")
+    blown_out_percent: Percent = Field(
+        default=45.0, description="share of clipped pixels from which a picture is blown out"
+    )
+    blocked_flat_percent: Percent = Field(default=70.0, description="share of the picture without any texture: blocked")
+    frozen_frames_n: int = Field(default=3, ge=0, description="so many identical pictures in a row: frozen; 0: never")
+    blurred_ratio: NotNegative = Field(
+        default=0.18, description="fine over coarse contrast below which a picture is blurred"
+    )
+    torn_s: Positive = Field(default=0.02, description="colour and depth taken further apart than this: torn")
+    knocked_mm: Positive = Field(
+        default=75.0, description="blade found further than this from where it should be: knocked"
+    )
+    knocked_deg: Positive = Field(default=5.0, description="blade found turned by more than this: knocked")
+    knocked_missing_percent: Percent = Field(
+        default=50.0, description="so much of the blade's face is not there: knocked"
+    )
+    depth_valid_percent: Percent = Field(
+        25.0, description="less valid depth than this in the whole picture: depth_missing"
+    )
+
+
+class PerceptionSettings(Settings):
+    """Section ``[perception]`` of the configuration file."""
+
+    method: Method = "fused"
+    color: ColorSettings = Field(default_factory=ColorSettings)
+    depth: DepthSettings = Field(default_factory=DepthSettings)
+    decision: DecisionSettings = Field(default_factory=DecisionSettings)
+    health: HealthSettings = Field(default_factory=HealthSettings)
+
+
+Mounting = Literal["facing_blade_from_front", "facing_blade_from_behind"]
+
+
+class StreamCalibration(Settings):
+    """One stream's lens and its place in the vehicle frame.
+
+    Pose in words a person can measure: position in the vehicle frame; ``pitch_down_deg`` below the horizon;
+    ``yaw_deg`` counter-clockwise seen from above, away from looking straight along the machine; ``roll_deg`` about the
+    line of sight, clockwise as seen in the picture's own direction of view. Lens: pixels, centres at integers.
+    """
+
+    width_px: int = Field(gt=0)
+    height_px: int = Field(gt=0)
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: Finite
+    cy_px: Finite
+    distortion_n: tuple[Finite, Finite, Finite, Finite, Finite] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    position_x_m: Finite
+    position_y_m: Finite
+    position_z_m: Finite
+    pitch_down_deg: Annotated[float, Field(gt=-89, lt=89)]
+    yaw_deg: Finite = 0.0
+    roll_deg: Finite = 0.0
+
+    def intrinsics(self) -> Intrinsics:
+        """The lens as the camera contract has it."""
+        return Intrinsics(
+            self.width_px, self.height_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.distortion_n
+        )
+
+    def pose(self, mounting: Mounting) -> StreamPose:
+        """The pose as position and rotation matrix (columns: optical axes in the vehicle frame)."""
+        rotation = rotation_from_angles(mounting, self.pitch_down_deg, self.yaw_deg, self.roll_deg)
+        rows = tuple((float(row[0]), float(row[1]), float(row[2])) for row in rotation)
+        return StreamPose((self.position_x_m, self.position_y_m, self.position_z_m), (rows[0], rows[1], rows[2]))
+
+    @classmethod
+    def from_pose(cls, lens: Intrinsics, pose: StreamPose, mounting: Mounting) -> StreamCalibration:
+        """The calibration of a stream with this lens and pose."""
+        pitch, yaw, roll = angles_from_rotation(mounting, np.asarray(pose.rotation, dtype=np.float64))
+        return cls(
+            width_px=lens.width,
+            height_px=lens.height,
+            fx_px=lens.fx,
+            fy_px=lens.fy,
+            cx_px=lens.cx,
+            cy_px=lens.cy,
+            distortion_n=lens.coeffs,
+            position_x_m=pose.position_m[0],
+            position_y_m=pose.position_m[1],
+            position_z_m=pose.position_m[2],
+            pitch_down_deg=pitch,
+            yaw_deg=yaw,
+            roll_deg=roll,
+        )
+
+
+def rotation_from_angles(
+    mounting: Mounting, pitch_down_deg: float, yaw_deg: float, roll_deg: float
+) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """Rotation (3x3, optical to vehicle) of a camera that is rolled, then pitched, then yawed."""
+    heading = 180.0 if mounting == "facing_blade_from_front" else 0.0
+    pitch, yaw, roll = (math.radians(angle) for angle in (pitch_down_deg, yaw_deg + heading, roll_deg))
+    ahead = np.array([math.cos(pitch), 0.0, -math.sin(pitch)])
+    right = np.array([0.0, -1.0, 0.0])
+    down = np.cross(ahead, right)
+    c, s = math.cos(roll), math.sin(roll)
+    unturned = np.column_stack((right * c + down * s, down * c - right * s, ahead))
+    turn = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(turn @ unturned, dtype=np.float64)
+
+
+def angles_from_rotation(
+    mounting: Mounting, rotation: np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+) -> tuple[float, float, float]:
+    """Inverse of :func:`rotation_from_angles`: pitch down, yaw and roll in degrees."""
+    heading = 180.0 if mounting == "facing_blade_from_front" else 0.0
+    ahead = rotation[:, 2]
+    pitch = math.degrees(math.asin(float(np.clip(-ahead[2], -1.0, 1.0))))
+    yaw = math.degrees(math.atan2(ahead[1], ahead[0])) - heading
+    yaw = (yaw + 180.0) % 360.0 - 180.0
+    level = rotation_from_angles(mounting, pitch, yaw, 0.0)
+    roll = math.degrees(math.atan2(float(level[:, 1] @ rotation[:, 0]), float(level[:, 0] @ rotation[:, 0])))
+    return pitch, yaw, roll
+
+
+def _nominal_color() -> StreamCalibration:
+    return StreamCalibration(
+        width_px=1280,
+        height_px=800,
+        fx_px=629.085,
+        fy_px=629.085,
+        cx_px=639.5,
+        cy_px=399.5,
+        position_x_m=0.8,
+        position_y_m=0.0295,
+        position_z_m=0.55,
+        pitch_down_deg=35.0,
+    )
+
+
+def _nominal_depth() -> StreamCalibration:
+    return StreamCalibration(
+        width_px=848,
+        height_px=480,
+        fx_px=427.675,
+        fy_px=427.675,
+        cx_px=423.5,
+        cy_px=239.5,
+        position_x_m=0.8,
+        position_y_m=-0.0295,
+        position_z_m=0.55,
+        pitch_down_deg=35.0,
+    )
+
+
+class CameraCalibration(Settings):
+    """Section ``[camera.calibration]``: where both streams sit and which way the camera faces.
+
+    ``mounting`` decides what left means: a camera ahead of the blade looks back at it, so the picture's left is the
+    machine's right. The defaults are the nominal pose of the quarter-scale machine with a D455.
+    """
+
+    mounting: Mounting = "facing_blade_from_front"
+    color: StreamCalibration = Field(default_factory=_nominal_color)
+    depth: StreamCalibration = Field(default_factory=_nominal_depth)
+    calibrated_at: str = Field(
+        default="", description="when `graderd calibrate camera` wrote this; empty: nominal values"
+    )
+    residual_mm: NotNegative = Field(default=0.0, description="rms distance of the blade's points after calibration")
+    residual_px: NotNegative = Field(default=0.0, description="rms distance of the blade's edge in the colour picture")
+
+
+__all__ = [
+    "METHODS",
+    "BladeGeometry",
+    "CameraCalibration",
+    "ColorSettings",
+    "DecisionSettings",
+    "DepthSettings",
+    "HealthSettings",
+    "Method",
+    "Mounting",
+    "PerceptionSettings",
+    "StreamCalibration",
+    "angles_from_rotation",
+    "rotation_from_angles",
+]
