@@ -1,0 +1,32 @@
+"""Shared by all tests: a task left running on the event loop fails the test that left it."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+from collections.abc import AsyncIterator
+
+import pytest
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Every asynchronous test gets the check for leaked tasks; synchronous ones need no event loop."""
+    for item in items:
+        if isinstance(item, pytest.Function) and inspect.iscoroutinefunction(item.obj):
+            item.fixturenames.insert(0, "no_leaked_tasks")
+
+
+@pytest.fixture
+async def no_leaked_tasks() -> AsyncIterator[None]:
+    """Fail a test whose tasks outlive it. Fixtures that start tasks end them in their own teardown first."""
+    before = asyncio.all_tasks()
+    yield
+    await asyncio.sleep(0)
+    here = asyncio.current_task()
+    leaked = [task for task in asyncio.all_tasks() - before if not task.done() and task is not here]
+    names = ", ".join(sorted(task.get_name() for task in leaked))
+    for task in leaked:
+        task.cancel()
+    if leaked:
+        await asyncio.gather(*leaked, return_exceptions=True)
+        pytest.fail(f"tasks left running: {names}")

@@ -1,0 +1,213 @@
+"""The gate: dense sweeps around every bound, and nothing gets out when it should not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from graderd.core.gate import AXES, AxisLimits, GateInputs, GateSettings, GateState, pass_gate
+from graderd.core.machine import ARMED, Goals, Mode, Pose
+
+SETTINGS = GateSettings()
+POSE = Pose(0.0, 100.0, 100.0, 50.0)
+DT_S = 0.02
+FIELDS = {"rotation": "rotation_deg", "lift_left": "lift_left_mm", "lift_right": "lift_right_mm", "tilt": "tilt_mm"}
+
+
+def inputs(**changes: object) -> GateInputs:
+    return replace(GateInputs(SETTINGS, Mode.MANUAL, POSE, DT_S, lease_ok=True, height_mm=0.0), **changes)  # type: ignore[arg-type]
+
+
+def goal(axis: str, value: float) -> Goals:
+    return Goals(**{FIELDS[axis]: value})
+
+
+def drive(goals: Goals, given_inputs: GateInputs, ticks_n: int, follow: bool = True) -> list[dict[str, float | None]]:
+    """Run the gate for some ticks on a machine that follows perfectly (or not at all); what came out, tick by tick."""
+    state, seen = GateState(), []
+    for _ in range(ticks_n):
+        state, passed = pass_gate(state, goals, given_inputs)
+        seen.append({axis: result.limited for axis, result in passed.items()})
+        if follow:
+            pose = given_inputs.pose
+            for axis, field in FIELDS.items():
+                if passed[axis].limited is not None:
+                    pose = replace(pose, **{field: passed[axis].limited})
+            given_inputs = replace(given_inputs, pose=pose)
+    return seen
+
+
+@pytest.mark.parametrize("mode", [Mode.DISARMED, Mode.STOPPED])
+@pytest.mark.parametrize("axis", AXES)
+def test_disarmed_or_stopped_only_staying_is_allowed(mode: Mode, axis: str) -> None:
+    state, passed = pass_gate(GateState(), goal(axis, 20.0), inputs(mode=mode))
+    assert all(result.limited is None for result in passed.values())
+    assert str(mode) in passed[axis].reason
+    assert not state.setpoints
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_no_goal_no_motion(axis: str) -> None:
+    _, passed = pass_gate(GateState(), Goals(), inputs())
+    assert passed[axis].limited is None
+    assert passed[axis].reason == ""
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_only_finite_numbers(axis: str, value: float) -> None:
+    _, passed = pass_gate(GateState(), goal(axis, value), inputs())
+    assert passed[axis].limited is None
+    assert "finite" in passed[axis].reason
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_no_motion_without_a_measurement(axis: str) -> None:
+    _, passed = pass_gate(GateState(), goal(axis, 20.0), inputs(pose=replace(POSE, **{FIELDS[axis]: None})))
+    assert passed[axis].limited is None
+    assert "measurement" in passed[axis].reason
+    _, passed = pass_gate(GateState(), goal(axis, 20.0), inputs(pose=replace(POSE, **{FIELDS[axis]: math.nan})))
+    assert passed[axis].limited is None
+    assert "measurement" in passed[axis].reason
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_no_motion_without_the_lease(axis: str) -> None:
+    _, passed = pass_gate(GateState(), goal(axis, 20.0), inputs(lease_ok=False))
+    assert passed[axis].limited is None
+    assert "lease" in passed[axis].reason
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("side", ["low", "high"])
+def test_absolute_limits_swept_densely(axis: str, side: str) -> None:
+    limits = SETTINGS.limits()[axis]
+    bound = getattr(limits, side)
+    start = replace(POSE, **{FIELDS[axis]: bound - 1.0 if side == "high" else bound + 1.0})
+    for step in range(-40, 41):
+        wanted = bound + step * 0.01
+        end = drive(goal(axis, wanted), inputs(pose=start), 200)[-1][axis]
+        assert end is not None
+        assert limits.low <= end <= limits.high
+        assert end == pytest.approx(min(max(wanted, limits.low), limits.high), abs=1e-9)
+        _, passed = pass_gate(GateState(), goal(axis, wanted), inputs(pose=start))
+        outside = wanted < limits.low or wanted > limits.high
+        assert bool(passed[axis].reason) is outside
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_window_around_the_armed_pose(axis: str, sign: float) -> None:
+    narrow = SETTINGS.model_copy(update={"rotation_window_deg": 5.0, "lift_window_mm": 5.0, "tilt_window_mm": 5.0})
+    start = getattr(POSE, FIELDS[axis])
+    for step in range(-20, 21):
+        offset = 5.0 + step * 0.05
+        seen = drive(goal(axis, start + sign * offset), inputs(settings=narrow), 300)
+        end = seen[-1][axis]
+        assert end is not None
+        assert abs(end - start) <= 5.0 + 1e-9
+        assert end == pytest.approx(start + sign * min(offset, 5.0), abs=1e-9)
+    _, passed = pass_gate(GateState(), goal(axis, start + sign * 5.1), inputs(settings=narrow))
+    assert "window" in passed[axis].reason
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_speed_and_acceleration_are_limited_and_it_arrives_without_overshoot(axis: str) -> None:
+    limits = SETTINGS.limits()[axis]
+    start = getattr(POSE, FIELDS[axis])
+    wanted = start + 0.6 * (limits.high - start)
+    path = [start, *[tick[axis] for tick in drive(goal(axis, wanted), inputs(), 1500)]]
+    speeds = [(b - a) / DT_S for a, b in pairwise(path)]
+    assert max(speeds) <= limits.speed + 1e-6
+    assert max(speeds) == pytest.approx(limits.speed, rel=0.02)
+    assert min(speeds) >= -1e-9
+    changes = [(b - a) / DT_S for a, b in pairwise([0.0, *speeds])]
+    assert max(changes) <= limits.acceleration + 1e-6
+    # The last tick's rounding on to the goal may brake a little harder than the ramp.
+    assert min(changes) >= -3.0 * limits.acceleration - 1e-6
+    assert path[-1] == wanted
+
+
+@given(st.lists(st.tuples(st.floats(-200, 200), st.booleans()), min_size=1, max_size=60))
+@settings(max_examples=200)
+def test_whatever_is_asked_the_goal_stays_inside_and_slow(asked: list[tuple[float, bool]]) -> None:
+    limits = SETTINGS.limits()["rotation"]
+    state, pose, last = GateState(), POSE, 0.0
+    for value, lease in asked:
+        state, passed = pass_gate(state, Goals(rotation_deg=value), inputs(pose=pose, lease_ok=lease))
+        limited = passed["rotation"].limited
+        if limited is None:
+            assert not lease
+            continue
+        assert limits.low <= limited <= limits.high
+        assert abs(limited - last) <= limits.speed * DT_S + 1e-6
+        last = limited
+        pose = replace(pose, rotation_deg=limited)
+
+
+def test_rotation_waits_for_the_blade_height() -> None:
+    high = SETTINGS.model_copy(update={"rotation_min_height_mm": 50.0})
+    for height_mm in [None, *[49.0 + 0.1 * i for i in range(10)]]:
+        _, passed = pass_gate(GateState(), goal("rotation", 10.0), inputs(settings=high, height_mm=height_mm))
+        assert passed["rotation"].limited is None
+        assert "height" in passed["rotation"].reason
+    for height_mm in (50.0, 50.1, 80.0):
+        _, passed = pass_gate(GateState(), goal("rotation", 10.0), inputs(settings=high, height_mm=height_mm))
+        assert passed["rotation"].limited is not None
+    _, passed = pass_gate(GateState(), goal("tilt", 60.0), inputs(settings=high, height_mm=0.0))
+    assert passed["tilt"].limited is not None
+
+
+def test_after_a_hold_it_starts_again_from_the_measured_position_at_rest() -> None:
+    state, given_inputs = GateState(), inputs()
+    for _ in range(20):
+        state, _ = pass_gate(state, goal("rotation", 40.0), given_inputs)
+    pushed = replace(POSE, rotation_deg=-3.0)
+    state, passed = pass_gate(state, Goals(), inputs(pose=pushed))
+    assert passed["rotation"].limited is None
+    assert (state.setpoints["rotation"].position, state.setpoints["rotation"].speed) == (-3.0, 0.0)
+    state, passed = pass_gate(state, goal("rotation", 40.0), inputs(pose=pushed))
+    limits = SETTINGS.limits()["rotation"]
+    assert passed["rotation"].limited == pytest.approx(-3.0 + limits.acceleration * DT_S * DT_S)
+
+
+def test_a_measurement_lost_in_motion_holds_and_keeps_the_armed_pose() -> None:
+    state, _ = pass_gate(GateState(), goal("rotation", 40.0), inputs())
+    lost = inputs(pose=replace(POSE, rotation_deg=None))
+    state, passed = pass_gate(state, goal("rotation", 40.0), lost)
+    assert passed["rotation"].limited is None
+    assert state.setpoints["rotation"].speed == 0.0
+    assert state.setpoints["rotation"].armed_at == 0.0
+
+
+def test_no_time_no_motion() -> None:
+    state, _ = pass_gate(GateState(), goal("rotation", 40.0), inputs())
+    after, passed = pass_gate(state, goal("rotation", 40.0), inputs(dt_s=0.0))
+    assert after.setpoints["rotation"] == state.setpoints["rotation"]
+    assert passed["rotation"].limited == state.setpoints["rotation"].position
+
+
+def test_disarming_forgets_the_window() -> None:
+    state, _ = pass_gate(GateState(), goal("rotation", 40.0), inputs())
+    assert state.setpoints
+    state, _ = pass_gate(state, Goals(), inputs(mode=Mode.DISARMED))
+    assert not state.setpoints
+
+
+@pytest.mark.parametrize("mode", ARMED)
+def test_armed_modes_move(mode: Mode) -> None:
+    _, passed = pass_gate(GateState(), goal("rotation", 40.0), inputs(mode=mode))
+    assert passed["rotation"].limited is not None
+    assert passed["rotation"].limited > 0.0
+
+
+def test_limits_in_the_wrong_order_are_refused() -> None:
+    with pytest.raises(ValueError, match="below"):
+        AxisLimits(low=1.0, high=1.0, window=1.0, speed=1.0, acceleration=1.0)
+    with pytest.raises(ValueError, match="below"):
+        GateSettings(rotation_min_deg=10.0, rotation_max_deg=-10.0)
