@@ -1,0 +1,103 @@
+"""Write the configuration file a fresh installation starts with: every key with its meaning and its default.
+
+``python packaging/config_template.py FILE``. Made from the models, so it cannot fall behind them. Defaults stand as
+comments: a key somebody sets is one they meant to set, and a better default reaches everybody else with an upgrade.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from graderd.config import Config, parse
+
+HEAD = """\
+# graderd's configuration. Read at start; `systemctl restart graderd` after a change (the restart begins disarmed).
+# A line that starts with #key shows a default: take the # away to set something else. Unknown keys are errors.
+# Names end in their unit: _deg _mm _m _s _hz _a _v _c _px, _n for counts and addresses. Left and right are the
+# operator's, facing forward. First steps on a machine: /usr/share/doc/graderd, or man graderd.
+
+"""
+
+# What differs from the defaults on an installed machine.
+INSTALLED: dict[str, Any] = {
+    "version": Config.model_fields["version"].default,
+    "recording.directory": "/var/lib/graderd/recordings",
+}
+
+
+def sections(model: BaseModel, path: tuple[str, ...] = ()) -> Iterator[str]:
+    """The text of one table: its own keys first, then its sub-tables."""
+    fields = type(model).model_fields
+    tables = {name: getattr(model, name) for name in fields if isinstance(getattr(model, name), BaseModel)}
+    plain = {name: field for name, field in fields.items() if name not in tables}
+    if path:
+        summary = (type(model).__doc__ or "").strip().splitlines()
+        yield "".join(f"# {line}\n" for line in textwrap.wrap(summary[0] if summary else "", 116))
+        # A table that is only whole with all its keys stands in comments with them.
+        whole = any(field.is_required() for field in plain.values())
+        yield f"{'#' if whole else ''}[{'.'.join(path)}]\n"
+    for name, field in plain.items():
+        # A section that is present starts from its class: what this instance has otherwise must be set.
+        own = not field.is_required() and getattr(model, name) != field.get_default(call_default_factory=True)
+        yield from _key(name, field, getattr(model, name), path, active=own)
+    yield "\n"
+    for name, value in tables.items():
+        yield from sections(value, (*path, name))
+
+
+def _key(name: str, field: FieldInfo, value: Any, path: tuple[str, ...], *, active: bool) -> Iterator[str]:
+    dotted = ".".join((*path, name))
+    if field.description:
+        yield "".join(f"# {line}\n" for line in textwrap.wrap(field.description, 116))
+    if dotted in INSTALLED:
+        yield f"{name} = {_toml(INSTALLED[dotted])}\n"
+    elif active:
+        yield f"{name} = {_toml(_plain(value))}\n"
+    elif value is None:
+        yield f"# {name}: not set\n"
+    elif isinstance(value, dict) and any(isinstance(item, BaseModel) for item in value.values()):
+        for key, item in value.items():
+            yield f"#{name}.{key} = {_toml(item.model_dump(mode='json', exclude_none=True))}\n"
+    else:
+        yield f"#{name} = {_toml(_plain(value))}\n"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json", exclude_none=True)
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    return str(tomlkit.item(value).as_string())
+
+
+def template() -> str:
+    """The whole file.
+
+    Raises:
+        ConfigError: the file, as it is or with every default taken out of its comment, would not be accepted.
+    """
+    text = HEAD + "".join(sections(Config())).rstrip() + "\n"
+    for variant in (text, re.sub(r"(?m)^#(?=[\w\[])", "", text)):
+        parse(tomlkit.parse(variant).unwrap(), text=variant)
+    return text
+
+
+if __name__ == "__main__":
+    Path(sys.argv[1]).write_text(template(), encoding="utf-8")

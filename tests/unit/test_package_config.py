@@ -1,0 +1,88 @@
+"""The configuration a package installs, and what becomes of an older one at an upgrade."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from graderd.config import Config, ConfigError, load
+from graderd.config.migrate import CURRENT_VERSION, migrate_file, migrate_text, rename
+
+PROJECT = Path(__file__).resolve().parents[2]
+
+OLD = """\
+# the yard's grader
+version = 0
+
+[servo]
+zero_deg = 12.5  # measured 2026-10-02
+
+[actuators.left]
+address_n = 21
+"""
+
+
+def test_migration_keeps_values_and_comments_and_leaves_a_backup(tmp_path: Path) -> None:
+    path = tmp_path / "graderd.toml"
+    path.write_text(OLD, encoding="utf-8")
+    path.chmod(0o660)
+    backup, changes = migrate_file(path)
+    assert backup is not None
+    assert backup.read_text(encoding="utf-8") == OLD
+    assert changes == ["servo is now rotation", "actuators.left is now lift_left"]
+    text = path.read_text(encoding="utf-8")
+    assert "# the yard's grader" in text
+    assert "# measured 2026-10-02" in text
+    assert path.stat().st_mode & 0o777 == 0o660
+    config = load(path)
+    assert config.version == CURRENT_VERSION
+    assert config.rotation.zero_deg == 12.5
+    assert config.lift_left.address_n == 21
+
+
+def test_a_present_file_is_not_touched(tmp_path: Path) -> None:
+    path = tmp_path / "graderd.toml"
+    path.write_text("version=1   # odd spacing stays\n", encoding="utf-8")
+    before = path.stat()
+    assert migrate_file(path) == (None, [])
+    assert path.stat().st_mtime_ns == before.st_mtime_ns
+    assert [entry.name for entry in tmp_path.iterdir()] == ["graderd.toml"]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("version = 99\n", "newer graderd"),
+        ("version = 0\n[servo]\nzero_dge = 1\n", "zero_deg"),
+        ("[[[", "not valid TOML"),
+    ],
+)
+def test_what_cannot_be_migrated_is_left_as_it_was(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "graderd.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=says):
+        migrate_file(path)
+    assert path.read_text(encoding="utf-8") == text
+    assert [entry.name for entry in tmp_path.iterdir()] == ["graderd.toml"]
+
+
+def test_steps_run_in_order_up_to_the_present_version() -> None:
+    steps = {5: lambda d: rename(d, "a.x", "b.x"), 6: lambda d: rename(d, "b.x", "b.y_deg")}
+    text, changes = migrate_text("version = 5\n[a]\nx = 3\n", steps, current=7)
+    assert tomllib.loads(text) == {"version": 7, "a": {}, "b": {"y_deg": 3}}
+    assert changes == ["a.x is now b.x", "b.x is now b.y_deg"]
+
+
+def test_the_installed_file_names_every_key_and_gives_the_defaults(tmp_path: Path) -> None:
+    path = tmp_path / "graderd.toml"
+    subprocess.run([sys.executable, PROJECT / "packaging" / "config_template.py", path], check=True)
+    config = load(path)
+    assert config.recording.directory == "/var/lib/graderd/recordings"
+    assert config.model_copy(update={"recording": Config().recording}) == Config()
+    text = path.read_text(encoding="utf-8")
+    for key in ("zero_deg", "usb_serial_number", "source_address_n", "serial_number", "stop_pgn_n", "socket_group"):
+        assert key in text
