@@ -1,0 +1,97 @@
+"""The interface as a FastAPI application over a :class:`~graderd.api.port.DaemonPort`."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from importlib.metadata import PackageNotFoundError, version
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from graderd.api.http_routes import http_routes
+from graderd.api.limiter import Limiter
+from graderd.api.port import DaemonPort
+from graderd.api.problem import Problem, ProblemError, problem_of_validation
+from graderd.api.settings import ApiLimits
+from graderd.api.sockets import socket_routes
+
+DESCRIPTION = """\
+The daemon's one interface, for the command line, the operator's page and any other client.
+
+It is served on a unix socket, whose file rights decide who may use it, and on TCP only where the configuration asks
+for it. Lengths are millimetres, angles degrees counter-clockwise seen from above, times seconds; the unit is part of
+every field's name, or stands in the field `unit` beside it.
+
+Anything that is refused is answered with the same three fields: `error` (why), `where` (which command, field or
+header) and `remedy` (what to do).
+
+Two paths are WebSockets: `/v1/stream` and `/v1/jog`. Messages are JSON texts.
+"""
+
+
+def make_app(port: DaemonPort, limits: ApiLimits | None = None) -> FastAPI:
+    """The application. ``app.state.closing`` is an event: set, it ends open streams."""
+    limits = limits or ApiLimits()
+    app = FastAPI(
+        title="graderd",
+        version=_version(),
+        description=DESCRIPTION,
+        openapi_url="/v1/openapi.json",
+        docs_url=None,
+        redoc_url=None,
+        license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
+        servers=[{"url": "http://localhost", "description": "over the unix socket"}],
+    )
+    app.state.closing = asyncio.Event()
+    app.include_router(http_routes(port, limits))
+    app.include_router(socket_routes(port, limits, app.state.closing))
+    app.add_middleware(Limiter, limits=limits)
+    for kind, handler in _handlers().items():
+        app.add_exception_handler(kind, handler)
+    return app
+
+
+def _handlers() -> dict[type[Exception], Callable[[Request, Exception], Awaitable[JSONResponse]]]:
+    """Every way a request can fail, brought to a problem."""
+
+    async def refused(_: Request, error: Exception) -> JSONResponse:
+        assert isinstance(error, ProblemError)
+        return JSONResponse(error.problem.model_dump(), error.status_code)
+
+    async def malformed(_: Request, error: Exception) -> JSONResponse:
+        assert isinstance(error, RequestValidationError)
+        return JSONResponse(problem_of_validation(error.errors()).model_dump(), 422)
+
+    async def http_error(request: Request, error: Exception) -> JSONResponse:
+        assert isinstance(error, HTTPException)
+        # FastAPI answers a body that is no JSON with 400; for a client that is one more malformed request.
+        status_code = 422 if error.status_code == 400 else error.status_code
+        problem = Problem(
+            error=str(error.detail), where=request.url.path[:200], remedy="the paths are listed at /v1/openapi.json"
+        )
+        return JSONResponse(problem.model_dump(), status_code, error.headers)
+
+    async def crashed(request: Request, _: Exception) -> JSONResponse:
+        problem = Problem(
+            error="an internal error, written to the daemon's log",
+            where=request.url.path[:200],
+            remedy="report it with the log",
+        )
+        return JSONResponse(problem.model_dump(), 500)
+
+    return {
+        ProblemError: refused,
+        RequestValidationError: malformed,
+        HTTPException: http_error,
+        Exception: crashed,
+    }
+
+
+def _version() -> str:
+    try:
+        return version("graderd")
+    except PackageNotFoundError:
+        return "0"

@@ -1,0 +1,137 @@
+"""The requests: status, commands, stop, configuration, preview, services."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Body, Path, Response
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
+
+from graderd.api.port import DaemonPort, ServiceError
+from graderd.api.problem import Problem, ProblemError
+from graderd.api.settings import ApiLimits
+from graderd.core.commands import AnyCommand, Command, Reply, Stop
+from graderd.core.status import Status
+
+COMMAND_EXAMPLES: dict[str, Any] = {
+    "arm": {"summary": "Power the devices and hold", "value": {"command": "arm", "client": "cab"}},
+    "stop": {"summary": "End motion at once", "value": {"command": "stop", "reason": "person near the blade"}},
+    "reset": {"summary": "Leave the latched stop", "value": {"command": "reset"}},
+    "auto": {"summary": "Let the rule turn the blade", "value": {"command": "auto"}},
+    "manual": {"summary": "Hold and take jogs", "value": {"command": "manual"}},
+    "jog": {
+        "summary": "Turn the blade 5° counter-clockwise; renew within the lease",
+        "value": {"command": "jog", "axis": "rotate", "value": 5.0, "relative": True, "client": "cab"},
+    },
+    "renew": {"summary": "Keep the lease", "value": {"command": "renew", "client": "cab"}},
+    "preset": {"summary": "Go to a named pose", "value": {"command": "preset", "name": "transport", "client": "cab"}},
+}
+PROBLEMS: dict[int | str, dict[str, Any]] = {
+    409: {"model": Problem, "description": "understood and refused; the machine is as it was"},
+    422: {"model": Problem, "description": "malformed; the machine is as it was"},
+    503: {"model": Problem, "description": "too many requests; stop is served all the same"},
+    504: {"model": Problem, "description": "the control tick did not answer in time"},
+}
+
+
+class StopRequest(BaseModel):
+    """Body of a stop; it may be left out."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"reason": "person near the blade"}]})
+
+    client: str = Field("", max_length=80, description="who asks")
+    reason: str = Field("stop request", max_length=200, description="kept as the reason of the stop")
+
+
+def http_routes(port: DaemonPort, limits: ApiLimits) -> APIRouter:
+    """The routes over ``port``."""
+    router = APIRouter(prefix="/v1")
+
+    @router.get("/status", tags=["status"], summary="Everything at the last control tick")
+    async def status() -> Status:
+        return port.status()
+
+    @router.post("/commands", tags=["commands"], summary="Send one command", responses=PROBLEMS)
+    async def command(command: Annotated[AnyCommand, Body(openapi_examples=COMMAND_EXAMPLES)]) -> Reply:
+        """The reply comes after the control tick that took the command.
+
+        A jog or preset moves only while its lease is renewed (`renew`, at least every 0.3 s, 0.1 s advised); the
+        WebSocket `/v1/jog` does that on one connection and gives the lease back when the connection ends.
+        """
+        return accepted(await obey(port, command, limits))
+
+    @router.post("/stop", tags=["commands"], summary="End motion at once", responses={504: PROBLEMS[504]})
+    async def stop(request: StopRequest | None = None) -> Reply:
+        """Wins over everything, latches, may be repeated; served ahead of every other request."""
+        request = request or StopRequest()
+        return accepted(await obey(port, Stop(client=request.client, reason=request.reason), limits))
+
+    @router.get("/config", tags=["status"], summary="The configuration in force")
+    async def config() -> dict[str, Any]:
+        return port.config()
+
+    @router.get(
+        "/preview.jpg",
+        tags=["status"],
+        summary="The newest picture with the three zones drawn on it",
+        response_class=Response,
+        responses={200: {"content": {"image/jpeg": {}}}, 404: {"model": Problem, "description": "no picture yet"}},
+    )
+    async def preview() -> Response:
+        try:
+            picture = await port.preview_jpeg()
+        except ServiceError as error:
+            raise ProblemError(404, error.message, "preview", error.remedy) from error
+        return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+
+    @router.post(
+        "/services/{name}",
+        tags=["services"],
+        summary="A device service outside the control loop",
+        responses={409: PROBLEMS[409], 422: PROBLEMS[422], 503: PROBLEMS[503]},
+    )
+    async def service(
+        name: Annotated[str, Path(max_length=80, pattern=r"^[a-z_.]+$", examples=["rotation.verify_profile"])],
+        arguments: Annotated[
+            dict[str, JsonValue] | None,
+            Body(openapi_examples={"reboot": {"summary": "Reboot the servo", "value": {"consent": True}}}),
+        ] = None,
+    ) -> dict[str, Any]:
+        """`rotation.verify_profile`, `rotation.reboot`, `rotation.step_response`, `camera.calibrate`. Those that
+        move a device or take its power want `consent: true`: somebody has looked and nobody is near the blade."""
+        try:
+            return await port.service(name, dict(arguments or {}))
+        except ServiceError as error:
+            raise ProblemError(409, error.message, name, error.remedy) from error
+
+    return router
+
+
+async def obey(port: DaemonPort, command: Command, limits: ApiLimits) -> Reply:
+    """Hand a command over and wait for its reply, not for ever.
+
+    Raises:
+        ProblemError: 504, the control tick did not answer.
+    """
+    try:
+        async with asyncio.timeout(limits.command_timeout_s):
+            return await port.command(command)
+    except TimeoutError as error:
+        raise ProblemError(
+            504,
+            f"the control tick did not answer within {limits.command_timeout_s:g} s",
+            command.command,
+            "look at the daemon's log; use the emergency stop if the blade moves",
+        ) from error
+
+
+def accepted(reply: Reply) -> Reply:
+    """The reply, if the command was accepted.
+
+    Raises:
+        ProblemError: 409, it was refused.
+    """
+    if not reply.accepted:
+        raise ProblemError(409, reply.message, reply.command, reply.remedy)
+    return reply

@@ -1,0 +1,252 @@
+"""Serves the application inside the daemon's event loop: on a unix socket, and on TCP where asked for."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import grp
+import os
+import socket
+import stat
+from collections import OrderedDict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI
+from starlette.types import ASGIApp
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+from graderd.api.guard import TcpGuard, load_or_make_token
+from graderd.api.settings import ApiLimits, TcpSettings
+from graderd.hal.errors import DeviceError
+
+ACCEPT_BATCH_N = 16
+LISTEN_QUEUE_N = 128
+STREAM_BUFFER_BYTES = 16_384
+MAX_PATH_BYTES = 107
+
+
+class SocketInUseError(DeviceError):
+    """Another daemon serves this socket."""
+
+
+class SocketError(DeviceError):
+    """The socket cannot be made or given its rights."""
+
+
+async def serve(
+    app: FastAPI,
+    socket_path: Path,
+    socket_mode: int = 0o660,
+    socket_group: str | None = None,
+    tcp: TcpSettings | None = None,
+    *,
+    limits: ApiLimits | None = None,
+    ready: asyncio.Event | None = None,
+) -> None:
+    """Serve ``app`` until cancelled; then end open streams, close, and take the socket file away.
+
+    Runs in the caller's event loop and leaves signals alone. ``ready`` is set when requests are answered.
+
+    Raises:
+        SocketInUseError: another daemon has the socket; it is not disturbed.
+        SocketError: the socket cannot be made, or not with these rights.
+        DeviceError: the token file is not usable.
+    """
+    limits = limits or ApiLimits()
+    with contextlib.ExitStack() as stack:
+        servers = [
+            _Server(_config(app, limits), stack.enter_context(unix_socket(socket_path, socket_mode, socket_group)))
+        ]
+        if tcp is not None:
+            listener = stack.enter_context(_tcp_socket(tcp))
+            port_n = listener.getsockname()[1]
+            guarded = TcpGuard(app, load_or_make_token(tcp.token_file), port_n, tcp.allowed_hosts)
+            servers.append(_Server(_config(guarded, limits), listener))
+        tasks = [asyncio.create_task(server.run_until_told(), name=f"api server {server.name}") for server in servers]
+        try:
+            await asyncio.gather(*(server.answering.wait() for server in servers))
+            if ready is not None:
+                ready.set()
+            await asyncio.gather(*tasks)
+        finally:
+            app.state.closing.set()
+            for server in servers:
+                server.should_exit = True
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+
+@contextlib.contextmanager
+def unix_socket(path: Path, mode: int, group: str | None) -> Iterator[socket.socket]:
+    """A listening socket at ``path``. A lock beside it, which dies with its process, tells a living daemon from a
+    socket file that a dead one left behind.
+
+    Raises:
+        SocketInUseError: see :func:`serve`.
+        SocketError: see :func:`serve`.
+    """
+    where = f"api socket {path}"
+    if len(os.fsencode(path)) > MAX_PATH_BYTES:
+        raise SocketError(where, f"the path is longer than {MAX_PATH_BYTES} bytes", "choose a shorter one")
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.callback(os.close, _lock(path))
+            _remove_stale(path)
+            listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+            # Linux takes the rights of the new file from the socket: nobody else gets in before they are set for good.
+            os.fchmod(listener.fileno(), 0o600)
+            listener.bind(str(path))
+            stack.callback(path.unlink, missing_ok=True)
+            if group is not None:
+                os.chown(path, -1, _group_id(group, where))
+            os.chmod(path, mode)
+        except OSError as error:
+            raise SocketError(
+                where, str(error.strerror or error), "see that the directory exists and the daemon may write to it"
+            ) from error
+        listener.setblocking(False)
+        yield listener
+
+
+def _lock(path: Path) -> int:
+    """Descriptor of the locked file beside the socket; it holds our process id for people."""
+    lock_path = path.with_name(path.name + ".lock")
+    descriptor = os.open(lock_path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        pid = os.read(descriptor, 32).decode("ascii", "replace").strip()
+        os.close(descriptor)
+        raise SocketInUseError(
+            f"api socket {path}",
+            f"another daemon{f' (process {pid})' if pid else ''} serves it",
+            "stop that one, or give this one another socket",
+        ) from None
+    os.truncate(descriptor, 0)
+    os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+    return descriptor
+
+
+def _remove_stale(path: Path) -> None:
+    """Take away what a dead daemon left at ``path``, and nothing else."""
+    try:
+        kind = path.lstat().st_mode
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(kind):
+        raise SocketError(f"api socket {path}", "there is a file of another kind", "remove it, or choose another path")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink(missing_ok=True)
+            return
+        except BlockingIOError:
+            pass  # its queue is full: somebody listens
+    raise SocketInUseError(
+        f"api socket {path}", "another program listens on it", "stop that one, or choose another path"
+    )
+
+
+def _group_id(group: str, where: str) -> int:
+    try:
+        return grp.getgrnam(group).gr_gid
+    except KeyError:
+        raise SocketError(where, f"there is no group {group}", "create it, or change socket_group") from None
+
+
+@contextlib.contextmanager
+def _tcp_socket(tcp: TcpSettings) -> Iterator[socket.socket]:
+    where = f"api tcp {tcp.host}:{tcp.port_n}"
+    family = socket.AF_INET6 if ":" in tcp.host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((tcp.host, tcp.port_n))
+        except OSError as error:
+            raise SocketError(where, str(error.strerror or error), "choose another host or port_n") from error
+        listener.setblocking(False)
+        yield listener
+
+
+def _config(app: ASGIApp, limits: ApiLimits) -> uvicorn.Config:
+    return uvicorn.Config(
+        app,
+        http=_bounded_http(limits),
+        ws=_StreamProtocol,
+        ws_max_size=limits.body_max_bytes_n,
+        ws_per_message_deflate=False,
+        lifespan="off",
+        log_config=None,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        date_header=False,
+        proxy_headers=False,
+        backlog=ACCEPT_BATCH_N,
+        timeout_graceful_shutdown=1,
+    )
+
+
+class _Server(uvicorn.Server):
+    """uvicorn on one socket of ours, told to end by ``should_exit`` alone: signals belong to the daemon."""
+
+    def __init__(self, config: uvicorn.Config, listener: socket.socket) -> None:
+        super().__init__(config)
+        self._listener = listener
+        self.answering = asyncio.Event()
+        self.name = str(listener.getsockname())
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+    async def run_until_told(self) -> None:
+        await self.serve(sockets=[self._listener])
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        # asyncio takes as many connections in one turn of the loop as the backlog it was told: few. The kernel may
+        # let more of them wait.
+        self._listener.listen(LISTEN_QUEUE_N)
+        self.answering.set()
+
+
+def _bounded_http(limits: ApiLimits) -> type[H11Protocol]:
+    """uvicorn's HTTP protocol with a bound on open connections: the oldest makes room for a new one, so that a client
+    that wants to send stop gets in however many hang about."""
+    open_connections: OrderedDict[H11Protocol, None] = OrderedDict()
+
+    class BoundedProtocol(H11Protocol):
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as in uvicorn
+            super().connection_made(transport)
+            open_connections[self] = None
+            if len(open_connections) > limits.connections_max_n:
+                oldest, _ = open_connections.popitem(last=False)
+                oldest.transport.abort()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            open_connections.pop(self, None)
+            super().connection_lost(exc)
+
+        def handle_websocket_upgrade(self, event: Any) -> None:
+            open_connections.pop(self, None)
+            super().handle_websocket_upgrade(event)
+
+    return BoundedProtocol
+
+
+class _StreamProtocol(WebSocketsSansIOProtocol):
+    """uvicorn's WebSocket protocol with small buffers, so that what a slow client reads at last is not old."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self.transport.set_write_buffer_limits(high=0)
+        connection = transport.get_extra_info("socket")
+        if connection is not None:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, STREAM_BUFFER_BYTES)

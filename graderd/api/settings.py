@@ -1,0 +1,52 @@
+"""Settings of the interface: who may reach it, and how much of the daemon's time it may take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field, model_validator
+
+from graderd.hal.settings import Positive, Settings
+
+LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
+
+
+class TcpSettings(Settings):
+    """The interface on TCP. It speaks plain HTTP: beyond loopback it belongs behind a tunnel or a TLS proxy."""
+
+    host: str = Field("127.0.0.1", description="address to listen on")
+    port_n: int = Field(8431, ge=0, le=65535, description="TCP port; 0: any free one")
+    token_file: Path = Field(
+        Path("/var/lib/graderd/api-token"), description="holds the token clients must send; made at first start"
+    )
+    allowed_hosts: tuple[str, ...] = Field(
+        (), description="names or addresses, beside the loopback ones, under which clients may reach this machine"
+    )
+
+    @model_validator(mode="after")
+    def _named(self) -> TcpSettings:
+        loopback = self.host in ("127.0.0.1", "::1", "localhost")
+        if not loopback and not self.allowed_hosts:
+            raise ValueError(
+                f"host {self.host} is not loopback: list in allowed_hosts the names by which clients reach it, "
+                "or keep 127.0.0.1 and use an SSH tunnel"
+            )
+        return self
+
+
+class ApiLimits(Settings):
+    """Bounds that keep a flood of requests from taking the control tick's time. Stop has a lane of its own."""
+
+    body_max_bytes_n: int = Field(16_384, ge=256, description="largest request body and WebSocket message")
+    body_timeout_s: Positive = Field(5.0, description="a request whose body takes longer is refused")
+    connections_max_n: int = Field(128, ge=4, description="open connections; the oldest makes room for a new one")
+    websockets_max_n: int = Field(16, ge=1, description="status streams and jog sockets together")
+    rate_hz: Positive = Field(250.0, description="requests served per second in the long run")
+    burst_n: int = Field(25, ge=1, description="requests served at once after a quiet time")
+    active_n: int = Field(8, ge=1, description="requests in work at the same time")
+    waiting_n: int = Field(48, ge=0, description="requests that may wait for their turn; beyond that: 503")
+    penalty_s: Positive = Field(0.5, description="a refused request is answered this much later, to slow a flood")
+    stop_rate_hz: Positive = Field(100.0, description="stop requests served per second, whatever else is going on")
+    services_n: int = Field(2, ge=1, description="device services running at the same time")
+    command_timeout_s: Positive = Field(2.0, description="a control tick that answers later is reported as stuck")
+    stream_max_hz: Positive = Field(20.0, description="status messages per second and client")

@@ -1,0 +1,171 @@
+"""The two WebSockets: the status stream, and the jog whose lease ends with its connection."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+from collections.abc import Coroutine
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, WebSocket
+from pydantic import TypeAdapter, ValidationError
+from starlette.websockets import WebSocketDisconnect
+
+from graderd.api.http_routes import obey
+from graderd.api.port import DaemonPort
+from graderd.api.problem import Problem, ProblemError, problem_of_validation
+from graderd.api.settings import ApiLimits
+from graderd.core.commands import AnyCommand, Command, Jog, Preset, Release, Reply, Stop
+from graderd.core.status import Status
+
+COMMAND: TypeAdapter[Command] = TypeAdapter(AnyCommand)
+MALFORMED_PAUSE_S = 0.1
+UPGRADE_ONLY: dict[int | str, dict[str, Any]] = {
+    101: {"description": "the WebSocket is open"},
+    426: {"model": Problem, "description": "asked for without a WebSocket upgrade"},
+}
+
+
+def socket_routes(port: DaemonPort, limits: ApiLimits, closing: asyncio.Event) -> APIRouter:
+    """The WebSockets over ``port``; ``closing`` ends them."""
+    router = APIRouter(prefix="/v1")
+    texts = _StatusTexts()
+    numbers = itertools.count(1)
+
+    @router.websocket("/stream")
+    async def stream(socket: WebSocket, rate_hz: Annotated[float, Query(gt=0, le=1000)] = limits.stream_max_hz) -> None:
+        await socket.accept()
+        await _until_closed(socket, _send_status(socket, port, texts, min(rate_hz, limits.stream_max_hz)), closing)
+
+    @router.websocket("/jog")
+    async def jog(socket: WebSocket, client: Annotated[str, Query(max_length=60)] = "jog") -> None:
+        await socket.accept()
+        session = _JogSession(port, limits, f"{client}#{next(numbers)}")
+        try:
+            await _until_closed(socket, session.run(socket), closing)
+        finally:
+            await session.release()
+
+    @router.get("/stream", tags=["status"], summary="WebSocket: status as it changes", responses=UPGRADE_ONLY)
+    async def stream_needs_upgrade(
+        rate_hz: Annotated[float, Query(gt=0, le=1000)] = limits.stream_max_hz,  # noqa: ARG001  (for the description)
+    ) -> Status:
+        """One `Status` a message, at most 20 a second (`rate_hz` asks for fewer). A slow client misses statuses; it
+        never gets old ones in a row, and it never makes the daemon keep them."""
+        raise _upgrade_needed("stream")
+
+    @router.get("/jog", tags=["commands"], summary="WebSocket: move by hand", responses=UPGRADE_ONLY)
+    async def jog_needs_upgrade(
+        client: Annotated[str, Query(max_length=60)] = "jog",  # noqa: ARG001  (for the description)
+    ) -> Reply:
+        """The client sends commands (`jog`, `preset`, `renew`, `release`, or any other), one a message, and gets for
+        each a `Reply` or a `Problem`, in order. The lease belongs to the connection: it is given back when the
+        connection ends for whatever reason, and lapses by itself 0.3 s after the last `renew`."""
+        raise _upgrade_needed("jog")
+
+    return router
+
+
+class _StatusTexts:
+    """The newest status as JSON, made once however many clients look on."""
+
+    def __init__(self) -> None:
+        self._status: Status | None = None
+        self._text = ""
+
+    def text(self, status: Status) -> str:
+        if status is not self._status:
+            self._status, self._text = status, status.model_dump_json()
+        return self._text
+
+
+class _JogSession:
+    """One client's connection: its commands carry a name nobody else has, so its lease is its own."""
+
+    def __init__(self, port: DaemonPort, limits: ApiLimits, client: str) -> None:
+        self._port = port
+        self._limits = limits
+        self._client = client
+        self._moved = False
+
+    async def run(self, socket: WebSocket) -> None:
+        """Obey one message after the other until the client goes."""
+        while True:
+            message = await socket.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            answer = await self._answer(message.get("text") or message.get("bytes") or b"")
+            await socket.send_text(answer.model_dump_json())
+
+    async def release(self) -> None:
+        """Give the lease back, if this client ever had one. A refusal only says that it has lapsed already."""
+        if self._moved:
+            self._moved = False
+            # A tick that does not answer lets the lease lapse by itself, or has stopped: nothing more to do here.
+            with contextlib.suppress(ProblemError):
+                await obey(self._port, Release(client=self._client), self._limits)
+
+    async def _answer(self, text: str | bytes) -> Reply | Problem:
+        try:
+            command = COMMAND.validate_json(text).model_copy(update={"client": self._client})
+        except ValidationError as error:
+            # A client in a loop of nonsense is slowed down; its connection is read again only afterwards.
+            await asyncio.sleep(MALFORMED_PAUSE_S)
+            return problem_of_validation(error.errors(include_input=False, include_url=False))
+        if isinstance(command, Jog | Preset):
+            self._moved = True
+        if isinstance(command, Stop | Release):
+            self._moved = False
+        try:
+            reply = await obey(self._port, command, self._limits)
+        except ProblemError as error:
+            return error.problem
+        return reply
+
+
+async def _send_status(socket: WebSocket, port: DaemonPort, texts: _StatusTexts, rate_hz: float) -> None:
+    """Send the newest status, then wait for a newer one and for the client's rate. ``send_text`` waits while the
+    client does not read, and what happened meanwhile is skipped: nothing queues up."""
+    loop = asyncio.get_running_loop()
+    after_s, due_s = float("-inf"), loop.time()
+    while True:
+        status = await port.next_status(after_s)
+        await socket.send_text(texts.text(status))
+        after_s = status.time_s
+        due_s = max(due_s + 1.0 / rate_hz, loop.time())
+        await asyncio.sleep(max(0.0, due_s - loop.time()))
+
+
+async def _until_closed(socket: WebSocket, work: Coroutine[Any, Any, None], closing: asyncio.Event) -> None:
+    """Run ``work`` until it is done, the client goes, or the daemon closes."""
+    path = socket.url.path
+    tasks = [
+        asyncio.create_task(work, name=f"api {path}"),
+        asyncio.create_task(closing.wait(), name=f"api {path} closing"),
+    ]
+    if not path.endswith("/jog"):
+        # The jog reads its own messages; of a stream's client only the end is of interest.
+        tasks.append(asyncio.create_task(_client_gone(socket), name=f"api {path} client"))
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            error = task.exception()
+            # RuntimeError is how starlette says that the connection was closed under a send.
+            if error is not None and not isinstance(error, WebSocketDisconnect | RuntimeError):
+                raise error
+        if closing.is_set():
+            await socket.close(1001, "the daemon ends")
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _client_gone(socket: WebSocket) -> None:
+    while (await socket.receive())["type"] != "websocket.disconnect":
+        pass
+
+
+def _upgrade_needed(what: str) -> ProblemError:
+    return ProblemError(426, f"/v1/{what} is a WebSocket", what, f"open ws://localhost/v1/{what}")

@@ -1,0 +1,260 @@
+"""Requests over a real unix socket: every route, every refusal in the same form, rights and stale sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import grp
+import json
+import os
+import stat
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from graderd.api.app import make_app
+from graderd.api.port import DaemonPort
+from graderd.api.server import SocketError, SocketInUseError, serve
+from graderd.api.settings import ApiLimits
+from graderd.core.machine import Mode, Unmet
+from graderd.core.status import Status
+from tests.unit.api_daemon import JPEG, FakeDaemon, serving
+
+
+@contextlib.asynccontextmanager
+async def client_of(path: Path) -> AsyncIterator[httpx.AsyncClient]:
+    transport = httpx.AsyncHTTPTransport(uds=str(path))
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost", timeout=10) as client:
+        yield client
+
+
+def test_the_fake_is_a_daemon_port() -> None:
+    port: DaemonPort = FakeDaemon()
+    assert port.status().mode is Mode.DISARMED
+
+
+async def test_status_is_the_status_model(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path), client_of(path) as client:
+        answer = await client.get("/v1/status")
+        assert answer.status_code == 200
+        assert Status.model_validate_json(answer.content).axes["rotation"].measured == 0.0
+        assert daemon.mode is Mode.DISARMED
+
+
+async def test_the_way_through_the_modes(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path), client_of(path) as client:
+        for command, mode in (("arm", Mode.MANUAL), ("auto", Mode.AUTO), ("manual", Mode.MANUAL)):
+            answer = await client.post("/v1/commands", json={"command": command})
+            assert answer.status_code == 200, answer.text
+            assert answer.json()["accepted"] is True
+            await daemon.until(lambda mode=mode: daemon.mode is mode)
+        assert (await client.post("/v1/stop", json={"reason": "test"})).json()["message"] == "stopped"
+        assert daemon.mode is Mode.STOPPED
+        refused = await client.post("/v1/commands", json={"command": "arm"})
+        assert refused.status_code == 409
+        assert refused.json() == {"error": "stopped: test", "where": "arm", "remedy": "reset first, then arm"}
+        assert (await client.post("/v1/commands", json={"command": "reset"})).status_code == 200
+        assert daemon.mode is Mode.DISARMED
+
+
+@pytest.mark.parametrize("body", [None, {}, {"reason": "x", "client": "y"}])
+async def test_stop_needs_no_body_and_may_be_repeated(tmp_path: Path, body: dict[str, str] | None) -> None:
+    async with serving(tmp_path) as (daemon, path), client_of(path) as client:
+        for _ in range(3):
+            answer = await client.post("/v1/stop") if body is None else await client.post("/v1/stop", json=body)
+            assert answer.status_code == 200, answer.text
+        assert daemon.mode is Mode.STOPPED
+
+
+async def test_arm_says_what_is_unmet_and_the_remedy(tmp_path: Path) -> None:
+    daemon = FakeDaemon(unmet=(Unmet("camera fresh", "no picture yet", "look at the camera's cable"),))
+    async with serving(tmp_path, daemon) as (_, path), client_of(path) as client:
+        refused = await client.post("/v1/commands", json={"command": "arm"})
+        assert refused.status_code == 409
+        assert refused.json()["error"] == "not ready: camera fresh: no picture yet"
+        assert refused.json()["remedy"] == "look at the camera's cable"
+
+
+MALFORMED: list[tuple[bytes, str]] = [
+    (b"", "body"),
+    (b"{", ""),
+    (b"[]", "body"),
+    (b"null", "body"),
+    (b'"stop"', "body"),
+    (b'{"command": "fly"}', "body"),
+    (b'{"command": "stop", "now": true}', "stop.now"),
+    (b'{"command": "jog", "axis": "rotate", "value": NaN}', "jog.value"),
+    (b'{"command": "jog", "axis": "rotate", "value": Infinity}', "jog.value"),
+    (b'{"command": "jog", "axis": "rotate", "value": 1e999}', "jog.value"),
+    (b'{"command": "jog", "axis": "wheel", "value": 1}', "jog.axis"),
+    (b'{"command": "jog", "axis": "rotate"}', "jog.value"),
+    (b'{"command": "arm", "client": "' + b"x" * 81 + b'"}', "arm.client"),
+    (b'{"command": "arm", "client": "\\ud800"}', "arm.client"),
+    (b'{"command": "jog", "axis": "rotate", "value": ' + b"9" * 6000 + b"}", ""),
+    (b"[" * 8000, ""),
+    (b"\xff\xfe\x00", ""),
+]
+
+
+@pytest.mark.parametrize(("body", "where"), MALFORMED, ids=range(len(MALFORMED)))
+async def test_malformed_commands_are_told_plainly_and_change_nothing(tmp_path: Path, body: bytes, where: str) -> None:
+    async with serving(tmp_path) as (daemon, path), client_of(path) as client:
+        answer = await client.post("/v1/commands", content=body, headers={"content-type": "application/json"})
+        assert answer.status_code == 422, answer.text
+        assert set(answer.json()) == {"error", "where", "remedy"}
+        assert answer.json()["error"]
+        assert not where or answer.json()["where"] == where
+        assert daemon.seen == []
+
+
+async def test_a_large_body_is_refused_and_the_next_request_served(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (_, path), client_of(path) as client:
+        for target in ("/v1/commands", "/v1/stop", "/v1/services/rotation.reboot"):
+            answer = await client.post(target, content=b" " * 20_000)
+            assert answer.status_code == 413
+            assert "16384" in answer.json()["error"]
+        assert (await client.get("/v1/status")).status_code == 200
+
+
+async def test_a_body_that_never_ends_is_given_up(tmp_path: Path) -> None:
+    async with serving(tmp_path, limits=ApiLimits(body_timeout_s=0.2)) as (_, path):
+        reader, writer = await asyncio.open_unix_connection(str(path))
+        writer.write(b"POST /v1/commands HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\n{")
+        assert b"408" in await asyncio.wait_for(reader.readline(), 5)
+        writer.close()
+        await writer.wait_closed()
+
+
+async def test_paths_and_methods_that_do_not_exist(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (_, path), client_of(path) as client:
+        assert (await client.get("/nothing")).status_code == 404
+        assert (await client.get("/nothing")).json()["where"] == "/nothing"
+        assert (await client.delete("/v1/status")).status_code == 405
+        for stream in ("/v1/stream", "/v1/jog"):
+            answer = await client.get(stream)
+            assert answer.status_code == 426
+            assert "WebSocket" in answer.json()["error"]
+
+
+async def test_config_preview_and_services(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path), client_of(path) as client:
+        assert (await client.get("/v1/config")).json()["machine"]["lease_s"] == 0.3
+        picture = await client.get("/v1/preview.jpg")
+        assert (picture.headers["content-type"], picture.content) == ("image/jpeg", JPEG)
+        daemon.picture = None
+        assert (await client.get("/v1/preview.jpg")).status_code == 404
+        assert (await client.post("/v1/services/rotation.verify_profile")).json() == {"differences": []}
+        refused = await client.post("/v1/services/rotation.reboot", json={})
+        assert refused.status_code == 409
+        assert refused.json()["where"] == "rotation.reboot"
+        assert "consent" in refused.json()["remedy"]
+        assert (await client.post("/v1/services/rotation.reboot", json={"consent": True})).json() == {"rebooted": True}
+        assert (await client.post("/v1/services/nothing")).status_code == 409
+        assert (await client.post("/v1/services/No%20Such")).status_code == 422
+
+
+async def test_a_tick_that_does_not_answer_is_reported(tmp_path: Path) -> None:
+    limits = ApiLimits(command_timeout_s=0.2)
+    async with serving(tmp_path, FakeDaemon(frozen=True), limits=limits) as (_, path), client_of(path) as client:
+        answer = await client.post("/v1/commands", json={"command": "arm"})
+        assert answer.status_code == 504
+        assert "control tick" in answer.json()["error"]
+
+
+async def test_an_internal_error_is_a_problem_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    class Broken(FakeDaemon):
+        def config(self) -> dict[str, Any]:
+            raise KeyError("a bug")
+
+    async with serving(tmp_path, Broken()) as (_, path), client_of(path) as client:
+        answer = await client.get("/v1/config")
+        assert answer.status_code == 500
+        assert answer.json()["where"] == "/v1/config"
+        assert "a bug" not in answer.text
+    assert "a bug" in caplog.text
+
+
+async def test_the_files_rights_decide(tmp_path: Path) -> None:
+    group = grp.getgrgid(os.getgid()).gr_name
+    path, ready = tmp_path / "g.sock", asyncio.Event()
+    task = asyncio.create_task(serve(make_app(FakeDaemon()), path, 0o640, group, ready=ready), name="api")
+    await ready.wait()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert path.stat().st_gid == os.getgid()
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert not path.exists()
+
+
+async def test_a_stale_socket_is_replaced_and_a_live_one_is_not(tmp_path: Path) -> None:
+    import socket
+
+    path = tmp_path / "api.sock"
+    left = socket.socket(socket.AF_UNIX)
+    left.bind(str(path))
+    left.close()
+    assert path.exists()
+    async with serving(tmp_path) as (_, path), client_of(path) as client:
+        with pytest.raises(SocketInUseError, match=f"another daemon \\(process {os.getpid()}\\) serves it") as error:
+            await serve(make_app(FakeDaemon()), path)
+        assert "\n" not in str(error.value)
+        assert (await client.get("/v1/status")).status_code == 200
+
+
+async def test_what_is_no_socket_of_ours_is_left_alone(tmp_path: Path) -> None:
+    import socket
+
+    precious = tmp_path / "precious"
+    precious.write_text("data")
+    with pytest.raises(SocketError, match="file of another kind"):
+        await serve(make_app(FakeDaemon()), precious)
+    assert precious.read_text() == "data"
+    with socket.socket(socket.AF_UNIX) as other:
+        other.bind(str(tmp_path / "other"))
+        other.listen()
+        with pytest.raises(SocketInUseError, match="another program"):
+            await serve(make_app(FakeDaemon()), tmp_path / "other")
+
+
+@pytest.mark.parametrize(
+    ("path", "group", "says"),
+    [
+        ("missing/api.sock", None, "No such file or directory"),
+        ("x" * 200, None, "longer than 107 bytes"),
+        ("api.sock", "no-such-group-here", "there is no group"),
+    ],
+)
+async def test_a_socket_that_cannot_be_made(tmp_path: Path, path: str, group: str | None, says: str) -> None:
+    with pytest.raises(SocketError, match=says):
+        await serve(make_app(FakeDaemon()), tmp_path / path, socket_group=group)
+    assert not (tmp_path / path).exists()
+
+
+async def test_the_description_is_complete(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (_, path), client_of(path) as client:
+        description = (await client.get("/v1/openapi.json")).json()
+    paths = description["paths"]
+    assert set(paths) == {
+        "/v1/status",
+        "/v1/commands",
+        "/v1/stop",
+        "/v1/config",
+        "/v1/preview.jpg",
+        "/v1/services/{name}",
+        "/v1/stream",
+        "/v1/jog",
+    }
+    for operations in paths.values():
+        for operation in operations.values():
+            assert operation["summary"]
+            assert operation["tags"]
+    body = paths["/v1/commands"]["post"]["requestBody"]["content"]["application/json"]
+    commands = {reference.rsplit("/", 1)[1] for reference in body["schema"]["discriminator"]["mapping"].values()}
+    assert commands == {"Arm", "Disarm", "Stop", "Reset", "Auto", "Manual", "Jog", "Preset", "Renew", "Release"}
+    assert set(body["examples"]) >= {"arm", "stop", "jog"}
+    assert {"409", "422", "503", "504"} <= set(paths["/v1/commands"]["post"]["responses"])
+    json.dumps(description, allow_nan=False)
