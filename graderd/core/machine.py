@@ -138,7 +138,13 @@ def step(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSett
     """One tick: faults first, then commands in their order, then automatic operation."""
     state = _react(state, inputs)
     replies: list[cmd.Reply] = []
+    stop_asked = any(isinstance(c, cmd.Stop) for c in inputs.commands)
     for command in sorted(inputs.commands, key=lambda c: not isinstance(c, cmd.Stop)):
+        if stop_asked and isinstance(command, cmd.Reset):
+            replies.append(
+                cmd.Reply(command="reset", accepted=False, message="stopped this moment", remedy="reset again")
+            )
+            continue
         state, reply = _obey(state, command, inputs, settings)
         replies.append(reply)
     state = _advance(state, inputs, settings, rule)
@@ -260,6 +266,9 @@ def _arm(
         return yes(state, f"already armed: {state.mode}")
     if state.arming_since_s is not None:
         return yes(state, "arming")
+    fault = worst(inputs.faults)
+    if fault is not None and fault.row.reaction >= Reaction.DISARM:
+        return no(f"{fault.name}: {fault.row.reads}", fault.row.remedy)
     if inputs.unmet:
         return no(
             "not ready: " + "; ".join(f"{u.name}: {u.reason}" for u in inputs.unmet),

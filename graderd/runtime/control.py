@@ -137,6 +137,7 @@ class ControlLoop:
         dt_s, self.time_s = now_s - self.time_s, now_s
         pose = self.pose(now_s)
         self.faults = update_faults(self.faults, self._present_faults(now_s), now_s, CATALOGUE)
+        self._clear_latches(commands)
         before = self.state
         # The machine answers stop first; replies are put back into the order the commands came in.
         order = sorted(range(len(commands)), key=lambda i: not isinstance(commands[i], cmd.Stop))
@@ -190,9 +191,8 @@ class ControlLoop:
                 # The driver is the last to say no (its own soft limits, a lost device); the axis holds.
                 self.passed[axis] = AxisPass(result.requested, None, str(error))
                 self._hold(axis)
-        if self._power.all_active and (angle := self.devices.rotation.telemetry().angle_deg) is not None:
-            self._eyes.send_angle(angle.value, angle.time_s)
-        elif (angle := self.devices.rotation.telemetry().angle_deg) is not None and angle.valid:
+        angle = self.devices.rotation.telemetry().angle_deg
+        if angle is not None and angle.valid:
             self._eyes.send_angle(angle.value, angle.time_s)
 
     def _send(self, axis: str, limited: float | None, speed_share: float) -> None:
@@ -264,11 +264,17 @@ class ControlLoop:
             self._hold_failed = self.devices.hold_all()
             self._moving.clear()
             self.last_stop = self._state_file.save(after.reason)
-        elif before.mode is Mode.STOPPED:
-            self.faults = clear_faults(self.faults, Clear.ON_RESET)
         elif after.mode in ARMED and before.mode not in ARMED:
-            self.faults = clear_faults(self.faults, Clear.ON_REARM)
             self._gate = GateState()
+
+    def _clear_latches(self, commands: tuple[cmd.Command, ...]) -> None:
+        """A reset or an arm lets go of latched faults whose cause is gone; what is still there stays and refuses."""
+        if any(isinstance(command, cmd.Stop) for command in commands):
+            return
+        if any(isinstance(command, cmd.Reset) for command in commands):
+            self.faults = clear_faults(self.faults, Clear.ON_RESET)
+        if self.state.mode is Mode.DISARMED and any(isinstance(command, cmd.Arm) for command in commands):
+            self.faults = clear_faults(self.faults, Clear.ON_REARM)
 
     @property
     def goals(self) -> Goals:
