@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
+from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.core.attitude import AttitudeGeometry, Preset
 from graderd.core.blade import BladeGeometry
 from graderd.core.gate import GateSettings
@@ -32,6 +33,7 @@ class ControlSettings(Settings):
     rotation_tolerance_deg: Positive = Field(0.5, description="arrived")
     actuator_tolerance_mm: Positive = Field(1.5, description="arrived; the actuators rest 1-2 mm short")
     overrun_s: Positive = Field(0.1, description="a tick later than this is a fault")
+    memory_warn_mb: Positive = 600.0
     shutdown_order: tuple[Literal["rotation", "actuators"], ...] = ("actuators", "rotation")
     shutdown_timeout_s: Positive = Field(1.5, description="for all devices together; then the wires are dropped")
 
@@ -42,15 +44,6 @@ class ControlSettings(Settings):
         return self
 
 
-class TcpSettings(Settings):
-    """The loopback page and interface; off unless a token is set."""
-
-    host: str = "127.0.0.1"
-    port_n: int = Field(8127, ge=1, le=65535)
-    token: str = Field(min_length=16, description="clients send it as 'Authorization: Bearer ...'")
-    allowed_hosts: tuple[str, ...] = ("127.0.0.1", "localhost")
-
-
 class ApiSettings(Settings):
     """Where clients reach the daemon."""
 
@@ -58,6 +51,7 @@ class ApiSettings(Settings):
     socket_mode: str = Field("0660", pattern=r"^0[0-7]{3}$")
     socket_group: str = Field("", description="group of the socket; empty: the daemon's own")
     tcp: TcpSettings | None = None
+    limits: ApiLimits = Field(default_factory=ApiLimits)
 
 
 class RecordingSettings(Settings):

@@ -59,7 +59,6 @@ class ControlLoop:
         eyes: Eyes,
         clock: Clock,
         state_file: StateFile,
-        on_tick: Callable[[ControlLoop], None] = lambda loop: None,
     ) -> None:
         self.config = config
         self.devices = devices
@@ -73,10 +72,10 @@ class ControlLoop:
         self.last_stop = state_file.load()
         self.connection_problems: dict[str, str] = {}
         self.extra_faults: list[Callable[[float], tuple[DeviceFault, ...]]] = []
+        self.on_tick: Callable[[], None] | None = None
         self._eyes = eyes
         self._clock = clock
         self._state_file = state_file
-        self._on_tick = on_tick
         self._gate = GateState()
         self._lift = LiftCoordinator(config.attitude)
         self._power = PowerKeeper(devices)
@@ -130,7 +129,8 @@ class ControlLoop:
         for (_, future), reply in zip(queued, replies, strict=True):
             if not future.done():
                 future.set_result(reply)
-        self._on_tick(self)
+        if self.on_tick is not None:
+            self.on_tick()
 
     def _step(self, commands: tuple[cmd.Command, ...]) -> tuple[cmd.Reply, ...]:
         now_s = self._clock.now_s()

@@ -36,6 +36,10 @@ class Link(Protocol):
 Service = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 
 
+def _publish_nowhere(names: tuple[str, ...]) -> None:
+    """Where there is no bus to tell."""
+
+
 @dataclass(frozen=True, slots=True)
 class Devices:
     """Everything that can move, the bus under it, and services outside the control loop by name."""
@@ -44,8 +48,8 @@ class Devices:
     link: Link
     actuators: dict[str, LinearActuator]
     services: dict[str, Service] = field(default_factory=dict)
-    set_published_faults: Callable[[tuple[DeviceFault, ...]], None] = lambda faults: None
-    """Puts the daemon's faults on the bus as diagnostic messages (DM1)."""
+    publish_faults: Callable[[tuple[str, ...]], None] = _publish_nowhere
+    """Puts the names of the active faults on the bus as diagnostic messages (DM1)."""
 
     def all(self) -> dict[str, Rotator | LinearActuator]:
         """The axes by device name."""

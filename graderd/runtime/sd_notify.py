@@ -1,4 +1,4 @@
-"""Tells systemd how the service is (sd_notify(3)): readiness, watchdog, status text. Silent where there is no systemd."""
+"""Tells systemd how the service is, as sd_notify(3): readiness, watchdog, status text. Silent without systemd."""
 
 from __future__ import annotations
 

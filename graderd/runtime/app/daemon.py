@@ -1,0 +1,202 @@
+"""The daemon process: builds everything, runs it in one task group, ends it in order."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import shutil
+import signal
+import sys
+import time
+from pathlib import Path
+
+from graderd.api import make_app
+from graderd.api.server import serve
+from graderd.config import Config, ConfigError, load
+from graderd.core import commands as cmd
+from graderd.core.machine import Mode
+from graderd.hal.clock import SystemClock
+from graderd.hal.errors import DeviceError
+from graderd.runtime.app.devices import build_devices
+from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
+from graderd.runtime.control import ControlLoop
+from graderd.runtime.health import HealthWatch
+from graderd.runtime.opening import open_devices
+from graderd.runtime.perception import PerceptionWorker
+from graderd.runtime.port import Port
+from graderd.runtime.recorder import Recorder
+from graderd.runtime.sd_notify import SystemdNotifier
+from graderd.runtime.state_file import StateFile
+
+STATUS_LINE_S = 5.0
+
+log = logging.getLogger("graderd")
+
+
+def run_daemon(config_path: Path | None, sim: bool, rig_dir: Path | None, as_json: bool) -> int:
+    """Run until SIGINT or SIGTERM. Returns the exit status: 0 after a clean end, 1 where it could not run."""
+    set_up_logging(as_json)
+    try:
+        config = load(config_path)
+    except ConfigError as error:
+        for problem in error.problems:
+            log.error("%s", problem)
+        return 2
+    try:
+        asyncio.run(_main(config, sim, rig_dir))
+    except* DeviceError as group:
+        for leaf in _leaves(group):
+            log.error("%s", leaf)
+        return 1
+    return 0
+
+
+async def _main(config: Config, sim: bool, rig_dir: Path | None) -> None:
+    rig: RigProcess | None = None
+    own_directory: Path | None = None
+    if sim and rig_dir is None:
+        own_directory = new_rig_directory()
+        rig = RigProcess(own_directory)
+    try:
+        if rig is not None:
+            await rig.start()
+            config = attach(config, rig.directory)
+        elif rig_dir is not None:
+            config = attach(config, rig_dir)
+        await Daemon(config, rig).run()
+    finally:
+        if rig is not None:
+            await rig.stop()
+        if own_directory is not None:
+            shutil.rmtree(own_directory, ignore_errors=True)
+
+
+class Daemon:
+    """Everything that runs, and the order in which it ends."""
+
+    def __init__(self, config: Config, rig: RigProcess | None = None) -> None:
+        clock = SystemClock()
+        self._config = config
+        self._rig = rig
+        self._notifier = SystemdNotifier()
+        self._eyes = PerceptionWorker(config.camera, config.camera.calibration, config.perception, config.blade, clock)
+        self._devices = build_devices(config, clock, on_bus_stop=self._stop_from_bus)
+        self._loop = ControlLoop(config, self._devices, self._eyes, clock, StateFile(config.state.directory))
+        self._port = Port(self._loop, self._eyes)
+        self._recorder = Recorder(config)
+        self._health = HealthWatch(config)
+        self._loop.extra_faults += [self._recorder.faults, self._health.faults]
+        self._loop.on_tick = self._after_tick
+        self._status_line_due_s = 0.0
+        self._ended = asyncio.Event()
+
+    def _stop_from_bus(self, reason: str) -> None:
+        self._loop.stop_now(cmd.Stop(reason=reason, client="can"))
+
+    def _after_tick(self) -> None:
+        """Runs in the tick: nothing here may wait."""
+        self._notifier.feed_watchdog()
+        self._port.published()
+        self._recorder.take(self._loop.time_s, self._port.status)
+        self._devices.publish_faults(tuple(f.name for f in self._loop.faults.active))
+        if self._loop.time_s >= self._status_line_due_s:
+            self._status_line_due_s = self._loop.time_s + STATUS_LINE_S
+            self._notifier.status(f"{self._loop.state.mode}: {self._loop.state.reason}")
+
+    async def run(self) -> None:
+        """Run until a signal, then stop motion, close the devices in the configured order, and return."""
+        running = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            running.add_signal_handler(number, self._on_signal, number)
+        answering = asyncio.Event()
+        try:
+            async with asyncio.TaskGroup() as group:
+                tasks = [
+                    group.create_task(self._serve(answering), name="api"),
+                    group.create_task(self._loop.run(), name="control-tick"),
+                    group.create_task(self._eyes.run(), name="perception"),
+                    group.create_task(open_devices(self._loop), name="open-devices"),
+                    group.create_task(self._health.run(), name="health"),
+                    group.create_task(self._recorder.run(), name="recorder"),
+                ]
+                if self._rig is not None:
+                    tasks.append(group.create_task(self._rig.run(), name="rig"))
+                await answering.wait()
+                self._notifier.ready("disarmed")
+                log.info("ready on %s, disarmed", self._config.api.socket)
+                await self._ended.wait()
+                await self._close_devices()
+                for task in tasks:
+                    task.cancel()
+        finally:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                running.remove_signal_handler(number)
+            await self._close_devices()
+            self._notifier.close()
+
+    async def _serve(self, answering: asyncio.Event) -> None:
+        api = self._config.api
+        path = Path(api.socket)
+        await serve(
+            make_app(self._port, api.limits),
+            path,
+            int(api.socket_mode, 8),
+            api.socket_group or None,
+            api.tcp,
+            limits=api.limits,
+            ready=answering,
+        )
+
+    def _on_signal(self, number: int) -> None:
+        name = signal.Signals(number).name
+        self._notifier.stopping()
+        self._loop.stop_now(cmd.Stop(reason=f"{name} received"))
+        self._ended.set()
+
+    async def _close_devices(self) -> None:
+        """Motion and torque end in the configured order, within the configured time, whatever a device does."""
+        order = self._config.control.shutdown_order
+        try:
+            async with asyncio.timeout(self._config.control.shutdown_timeout_s):
+                for part in order:
+                    await self._close_part(part)
+                await self._devices.link.close()
+        except TimeoutError:
+            log.error("devices did not close within %.1f s", self._config.control.shutdown_timeout_s)
+
+    async def _close_part(self, part: str) -> None:
+        devices = [self._devices.rotation] if part == "rotation" else list(self._devices.actuators.values())
+        for result in await asyncio.gather(*(device.close() for device in devices), return_exceptions=True):
+            if isinstance(result, Exception):
+                log.error("closing %s: %s", part, result)
+
+
+class _JsonLines(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        line = {"time": time.time(), "level": record.levelname.lower(), "event": "log", "message": record.getMessage()}
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line)
+
+
+def set_up_logging(as_json: bool) -> None:
+    """One line an event on stderr; the journal adds the time, a terminal gets it from us."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_JsonLines() if as_json else logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+    logging.getLogger("can").setLevel(logging.ERROR)
+    logging.getLogger("uvicorn").setLevel(logging.WARNING)
+
+
+def _leaves(group: BaseExceptionGroup[DeviceError]) -> list[DeviceError]:
+    found: list[DeviceError] = []
+    for error in group.exceptions:
+        if isinstance(error, BaseExceptionGroup):
+            found += _leaves(error)
+        elif error not in found:
+            found.append(error)
+    return found
+
+
+__all__ = ["Daemon", "Mode", "run_daemon", "set_up_logging"]

@@ -1,0 +1,86 @@
+"""The daemon as its clients' interface sees it: implements ``graderd.api.port.DaemonPort``."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from graderd.api.port import ServiceError
+from graderd.core.commands import Command, Reply
+from graderd.core.machine import Mode
+from graderd.core.status import Status
+from graderd.hal.errors import DeviceError
+from graderd.runtime.control import ControlLoop
+from graderd.runtime.perception import PerceptionWorker
+from graderd.runtime.status import build_status
+
+SERVICES_IN_ANY_MODE = frozenset({"rotation.verify_profile"})
+
+
+class Port:
+    """Status is built once per tick and only when somebody waits for it."""
+
+    def __init__(self, loop: ControlLoop, eyes: PerceptionWorker) -> None:
+        self._loop = loop
+        self._eyes = eyes
+        self._waiting: list[asyncio.Future[Status]] = []
+        self._cached: Status | None = None
+
+    def published(self) -> None:
+        """Called after each tick: hand the new status to those who wait."""
+        self._cached = None
+        if self._waiting:
+            status = self.status()
+            waiting, self._waiting = self._waiting, []
+            for future in waiting:
+                if not future.done():
+                    future.set_result(status)
+
+    def status(self) -> Status:
+        """The state at the last control tick."""
+        if self._cached is None:
+            self._cached = build_status(self._loop, self._eyes)
+        return self._cached
+
+    async def next_status(self, after_s: float) -> Status:
+        """Wait for a status newer than ``after_s``."""
+        if self._loop.time_s > after_s:
+            return self.status()
+        future: asyncio.Future[Status] = asyncio.get_running_loop().create_future()
+        self._waiting.append(future)
+        return await future
+
+    async def command(self, command: Command) -> Reply:
+        """Hand a command to the next tick; stop acts at once."""
+        return await self._loop.command(command)
+
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration."""
+        return self._loop.config.model_dump(mode="json")
+
+    async def preview_jpeg(self) -> bytes:
+        """The newest annotated picture."""
+        try:
+            return await self._eyes.preview_jpeg()
+        except TimeoutError:
+            raise ServiceError("the camera gives no picture", "see graderd status for its fault") from None
+
+    async def service(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Run a device service; those that move or unpower need manual or disarmed mode and consent."""
+        service = self._loop.devices.services.get(name)
+        if service is None:
+            known = ", ".join(sorted(self._loop.devices.services))
+            raise ServiceError(f"there is no service '{name}'", f"there are: {known}")
+        arguments = dict(arguments)
+        consent = bool(arguments.pop("consent", False))
+        if name not in SERVICES_IN_ANY_MODE:
+            if not consent:
+                raise ServiceError(
+                    f"{name} may move or unpower the blade", "repeat with consent when the area is clear"
+                )
+            if self._loop.state.mode is not Mode.DISARMED:
+                raise ServiceError(f"{name} needs a disarmed machine; it is {self._loop.state.mode}", "disarm first")
+        try:
+            return await service(arguments)
+        except DeviceError as error:
+            raise ServiceError(f"{error.where}: {error.cause}", error.remedy) from error
