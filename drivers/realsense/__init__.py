@@ -1,0 +1,17 @@
+"""The RealSense camera: live on USB, or from a recording; and plain pictures and videos from files."""
+
+from drivers.realsense.files import PICTURE_SUFFIXES, VIDEO_SUFFIXES, FolderCamera, VideoCamera
+from drivers.realsense.live import RealSenseCamera
+from drivers.realsense.recording import RecordingCamera
+
+RECORDING_SUFFIXES = frozenset({".db3", ".bag"})
+
+__all__ = [
+    "PICTURE_SUFFIXES",
+    "RECORDING_SUFFIXES",
+    "VIDEO_SUFFIXES",
+    "FolderCamera",
+    "RealSenseCamera",
+    "RecordingCamera",
+    "VideoCamera",
+]

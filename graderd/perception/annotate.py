@@ -86,8 +86,10 @@ def _label(picture: U8, outline: F64, third: int, observation: SoilObservation, 
 
 def text_on(picture: U8, text: str, at: tuple[int, int], size: float, color: Bgr = WHITE) -> None:
     """Text with a dark rim, readable on any ground."""
-    thick = max(1, round(2 * size))
-    cv2.putText(picture, text, at, FONT, size, DARK, thick + max(2, round(3 * size)), cv2.LINE_AA)
+    thick, rim = max(1, round(2 * size)), max(1, round(1.6 * size))
+    # The same strokes shifted round: a thicker stroke would be a wider font.
+    for dx, dy in ((-rim, 0), (rim, 0), (0, -rim), (0, rim), (-rim, rim), (rim, rim), (-rim, -rim), (rim, -rim)):
+        cv2.putText(picture, text, (at[0] + dx, at[1] + dy), FONT, size, DARK, thick, cv2.LINE_AA)
     cv2.putText(picture, text, at, FONT, size, color, thick, cv2.LINE_AA)
 
 
