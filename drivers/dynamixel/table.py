@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass, field
 from typing import Any
 
 import firmware_profiles
+
+_CODES = {1: "B", 2: "H", 4: "I"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,18 +76,40 @@ class Block:
     registers: tuple[Register, ...]
     address: int = field(init=False)
     size: int = field(init=False)
+    _names: tuple[str, ...] = field(init=False, repr=False)
+    _layout: struct.Struct = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "address", self.registers[0].address)
         object.__setattr__(self, "size", self.registers[-1].end - self.registers[0].address)
+        codes, at = ["<"], self.address
+        for r in self.registers:
+            code = _CODES[r.size]
+            codes += ["x" * (r.address - at), code.lower() if r.signed else code]
+            at = r.end
+        object.__setattr__(self, "_names", tuple(r.name for r in self.registers))
+        object.__setattr__(self, "_layout", struct.Struct("".join(codes)))
 
     def decode(self, data: bytes) -> dict[str, int]:
-        """Values by register name from the ``size`` bytes of the block."""
-        base = self.address
-        return {
-            r.name: int.from_bytes(data[r.address - base : r.address - base + r.size], "little", signed=r.signed)
-            for r in self.registers
-        }
+        """Values by register name from the ``size`` bytes of the block.
+
+        Raises:
+            ValueError: ``data`` has another length.
+        """
+        if len(data) != self.size:
+            raise ValueError(f"the block at {self.address} has {self.size} bytes, not {len(data)}")
+        return dict(zip(self._names, self._layout.unpack(data), strict=True))
+
+    def encode(self, values: dict[str, int]) -> bytes:
+        """The block's bytes for a write of all its registers.
+
+        Raises:
+            ValueError: a value does not fit into its register, or one is missing.
+        """
+        try:
+            return self._layout.pack(*(values[name] for name in self._names))
+        except (struct.error, KeyError) as e:
+            raise ValueError(f"cannot write {self._names}: {e}") from None
 
 
 class ControlTable:

@@ -1,0 +1,392 @@
+"""The servo wire: one owner, one request in flight, every request with a deadline. Asyncio over the port's own fd.
+
+How a late reply is kept from being taken for another one's: Protocol 2.0 has no sequence numbers. After a request
+timed out, the next thing sent is a ping, and everything that comes before the ping's reply is thrown away: replies
+keep their order, and no read of ours is as long as a ping's reply. Deadlines follow what the line was measured to
+need (as TCP does it), so that a slow adapter costs no retries and a quick one no waiting.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import os
+from collections import deque
+from collections.abc import Callable
+from typing import Literal
+
+import serial
+
+from drivers.dynamixel import ports
+from drivers.dynamixel.codec import BROADCAST_ID, Instruction, Packet, StatusError, StreamDecoder, encode
+from graderd.hal.clock import Clock, SystemClock
+from graderd.hal.errors import DeviceError, DeviceLostError, DeviceRefusedError, DeviceTimeoutError
+
+log = logging.getLogger(__name__)
+
+BusLog = Callable[[float, Literal["tx", "rx"], bytes], None]
+"""Called with monotonic seconds, direction and bytes of everything that crosses the wire."""
+
+_BITS_PER_BYTE = 10
+_STATUS_BYTES = 11  # a status packet without data
+_PING_DATA_BYTES = 3
+_ALLOWANCE_MIN_S = 0.012
+_ALLOWANCE_START_S = 0.060
+_ALLOWANCE_MAX_S = 0.100
+"""Bounds of what a reply may take beyond wire time: scheduling at the low end, a bad USB adapter at the high one."""
+
+_encode_read = functools.lru_cache(maxsize=64)(encode)
+"""Polling asks the same few questions for ever."""
+
+
+class ServoRefusedError(DeviceRefusedError):
+    """The servo answered with an error number; ``error`` is its :class:`~drivers.dynamixel.codec.StatusError` value."""
+
+    def __init__(self, where: str, request: str, error: int) -> None:
+        known = error in StatusError.__members__.values()
+        name = StatusError(error).name.lower() if known else f"error {error}"
+        super().__init__(where, f"servo refused {request}: {name}")
+        self.error = error
+
+
+class ServoBus:
+    """One serial port with Protocol 2.0 servos on it.
+
+    Args:
+        port: path of the port.
+        baud_n: bits per second.
+        clock: monotonic seconds for the log's times.
+        bus_log: called with every chunk of bytes sent and received.
+        return_delay_s: the servos' Return Delay Time (factory 500 µs), part of each deadline.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        baud_n: int,
+        *,
+        clock: Clock | None = None,
+        bus_log: BusLog | None = None,
+        return_delay_s: float = 0.000508,
+    ) -> None:
+        self.port = port
+        self.baud_n = baud_n
+        self.low_latency = False
+        self.latency_timer_ms: int | None = None
+        self.last_valid_s = float("-inf")
+        self._clock: Clock = clock or SystemClock()
+        self._log = bus_log
+        self._byte_s = _BITS_PER_BYTE / baud_n
+        self._return_delay_s = return_delay_s
+        self._serial: serial.Serial | None = None
+        self._fd = -1
+        self._decoder = StreamDecoder()
+        self._busy = False
+        self._queue: deque[asyncio.Future[None]] = deque()
+        self._reply: asyncio.Future[Packet | None] | None = None
+        self._wanted_id = 0
+        self._wanted_data_n: int | None = None
+        self._suspect = False
+        self._smooth_s = 0.0
+        self._spread_s = 0.0
+        self._allowance_s = _ALLOWANCE_START_S
+        self._counters = dict.fromkeys(
+            (
+                "requests_n", "replies_n", "retries_n", "timeouts_n", "refused_n", "foreign_n", "late_n", "echo_n",
+                "invalid_n", "fences_n",
+            ),
+            0,
+        )  # fmt: skip
+
+    # -- life ---------------------------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Open the port; nothing is sent.
+
+        Raises:
+            DeviceMissingError: no such port, or it may not be opened.
+            DeviceRefusedError: the adapter cannot do the baud rate.
+        """
+        self._serial = ports.open_port(self.port, self.baud_n)
+        self.low_latency = ports.set_low_latency(self._serial)
+        self.latency_timer_ms = ports.latency_timer_ms(self.port)
+        if (self.latency_timer_ms or 0) > 2:
+            log.warning(
+                "%s: the adapter holds replies back for %d ms (low_latency not available): at most %d requests "
+                "a second. Set its latency_timer to 1 with the udev rule",
+                self.port, self.latency_timer_ms, 1000 // (self.latency_timer_ms or 1),
+            )  # fmt: skip
+        self._fd = self._serial.fileno()
+        os.set_blocking(self._fd, False)
+        asyncio.get_running_loop().add_reader(self._fd, self._on_readable)
+
+    def close(self) -> None:
+        """Let go of the port; a request in flight fails. Idempotent."""
+        self._shut(DeviceLostError(self.port, "the port was closed"))
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the port is open and was not lost."""
+        return self._fd >= 0
+
+    def _shut(self, error: DeviceError) -> None:
+        if self._fd >= 0:
+            asyncio.get_running_loop().remove_reader(self._fd)
+            self._fd = -1
+        if self._serial is not None:
+            opened, self._serial = self._serial, None
+            try:
+                opened.close()
+            except (OSError, serial.SerialException) as e:
+                log.debug("%s: closing a vanished port: %s", self.port, e)
+        if self._reply is not None and not self._reply.done():
+            self._reply.set_exception(error)
+
+    def counters(self) -> dict[str, int]:
+        """What happened on the wire since the bus was made."""
+        return {
+            **self._counters,
+            "crc_errors_n": self._decoder.crc_errors_n,
+            "stray_bytes_n": self._decoder.stray_n,
+            "low_latency_n": int(self.low_latency),
+        }
+
+    # -- requests -----------------------------------------------------------------------------------------------
+
+    async def ping(self, servo_id: int, *, attempts_n: int = 2) -> tuple[int, int]:
+        """Model number and firmware version of the servo with that id.
+
+        Raises:
+            DeviceTimeoutError, DeviceLostError: as :meth:`request`.
+        """
+        data = (await self.request(servo_id, Instruction.PING, b"", _PING_DATA_BYTES, attempts_n=attempts_n)).data
+        return data[0] | data[1] << 8, data[2]
+
+    async def read(self, servo_id: int, address: int, size: int, *, attempts_n: int = 2) -> Packet:
+        """``size`` bytes from ``address``; the packet's ``data`` holds exactly that many, ``alert`` stands beside it.
+
+        Raises:
+            ServoRefusedError: the servo answered with an error.
+            DeviceTimeoutError, DeviceLostError: as :meth:`request`.
+        """
+        if size == _PING_DATA_BYTES or size <= 0:
+            raise ValueError(f"a read of {size} bytes could not be told from other replies")
+        params = bytes((address & 0xFF, address >> 8, size & 0xFF, size >> 8))
+        return await self.request(servo_id, Instruction.READ, params, size, attempts_n=attempts_n)
+
+    async def write(
+        self, servo_id: int, address: int, data: bytes, *, attempts_n: int = 2, urgent: bool = False
+    ) -> Packet:
+        """Write absolute values (writing them twice does no harm) and wait for the servo's word.
+
+        Raises:
+            ServoRefusedError: the servo answered with an error; nothing was written.
+            DeviceTimeoutError, DeviceLostError: as :meth:`request`; it may have been written.
+        """
+        params = address.to_bytes(2, "little") + data
+        return await self.request(servo_id, Instruction.WRITE, params, 0, attempts_n=attempts_n, urgent=urgent)
+
+    async def send(self, servo_id: int, instruction: int, params: bytes = b"") -> None:
+        """Send an instruction that nobody answers (broadcasts; a servo whose status return level is unknown)."""
+        await self._acquire(False)
+        try:
+            self._transmit(encode(servo_id, instruction, params))
+            await asyncio.sleep(self._byte_s * (12 + len(params)) + self._return_delay_s)
+            self._suspect = servo_id != BROADCAST_ID  # should it answer after all, that is not the next one's reply
+        finally:
+            self._release()
+
+    async def request(
+        self,
+        servo_id: int,
+        instruction: int,
+        params: bytes = b"",
+        reply_data_n: int | None = 0,
+        *,
+        attempts_n: int = 1,
+        urgent: bool = False,
+    ) -> Packet:
+        """Send an instruction and return its valid status packet.
+
+        ``attempts_n`` bounds the sends; more than 1 only for what may be carried out twice (reads, absolute writes).
+        ``urgent`` requests go ahead of all others that wait, also between another one's attempts.
+
+        Raises:
+            ServoRefusedError: the servo answered with an error number.
+            DeviceTimeoutError: no valid reply in any attempt.
+            DeviceLostError: the port is gone.
+        """
+        packet = (_encode_read if instruction == Instruction.READ else encode)(servo_id, instruction, params)
+        for attempt in range(attempts_n):
+            if self._busy:
+                await self._acquire(urgent)
+            else:
+                self._busy = True
+            try:
+                if attempt:
+                    self._counters["retries_n"] += 1
+                if self._suspect and not await self._fence(servo_id):
+                    continue
+                reply = await self._exchange(packet, servo_id, reply_data_n)
+            finally:
+                self._release()
+            if reply is None:
+                continue
+            error = reply.error
+            if error == StatusError.NONE:
+                return reply
+            if error == StatusError.CRC and attempt + 1 < attempts_n:
+                continue
+            self._counters["refused_n"] += 1
+            raise ServoRefusedError(self._where(servo_id), _describe(instruction, params), error)
+        raise DeviceTimeoutError(
+            self._where(servo_id),
+            f"no valid status packet to {_describe(instruction, params)} in {attempts_n} attempt(s)",
+            "Check power, cable, id and baud rate",
+        )
+
+    def _where(self, servo_id: int) -> str:
+        return f"servo {servo_id} at {self.port}"
+
+    async def _fence(self, servo_id: int) -> bool:
+        """Make sure that nothing of former requests is still on its way."""
+        self._counters["fences_n"] += 1
+        self._decoder.reset()
+        ping = encode(servo_id, Instruction.PING)
+        if await self._exchange(ping, servo_id, _PING_DATA_BYTES) is None:
+            return False
+        self._suspect = False
+        return True
+
+    async def _exchange(self, packet: bytes, servo_id: int, reply_data_n: int | None) -> Packet | None:
+        """One send and the wait for its reply; None where the deadline passed."""
+        loop = asyncio.get_running_loop()
+        on_wire_s = (len(packet) + _STATUS_BYTES + (reply_data_n or 0)) * self._byte_s + self._return_delay_s
+        self._decoder.reset()
+        self._wanted_id, self._wanted_data_n = servo_id, reply_data_n
+        self._reply = reply = loop.create_future()
+        self._counters["requests_n"] += 1
+        started_s = loop.time()
+        try:
+            self._transmit(packet)
+            timer = loop.call_at(started_s + on_wire_s + self._allowance_s, self._on_deadline, reply)
+            try:
+                answer: Packet | None = await reply
+            finally:
+                timer.cancel()
+        except BaseException:
+            self._suspect = True
+            raise
+        finally:
+            self._reply = None
+        if answer is None:
+            self._suspect = True
+            self._counters["timeouts_n"] += 1
+            self._allowance_s = min(_ALLOWANCE_MAX_S, self._allowance_s * 1.5)
+            return None
+        self._learn(max(0.0, loop.time() - started_s - on_wire_s))
+        return answer
+
+    def _learn(self, extra_s: float) -> None:
+        """Smoothed mean and spread of what replies take beyond wire time set the next deadline (RFC 6298)."""
+        self._spread_s += 0.25 * (abs(extra_s - self._smooth_s) - self._spread_s)
+        self._smooth_s += 0.125 * (extra_s - self._smooth_s)
+        self._allowance_s = min(
+            _ALLOWANCE_MAX_S, max(_ALLOWANCE_MIN_S, self._smooth_s + 4 * self._spread_s + 0.5 * _ALLOWANCE_MIN_S)
+        )
+
+    def _on_deadline(self, reply: asyncio.Future[Packet | None]) -> None:
+        if not reply.done():
+            self._on_readable()  # a busy loop may be late for bytes that were in time
+        if not reply.done():
+            reply.set_result(None)
+
+    # -- turns on the wire --------------------------------------------------------------------------------------
+
+    async def _acquire(self, urgent: bool) -> None:
+        if not self._busy:
+            self._busy = True
+            return
+        turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        if urgent:
+            self._queue.appendleft(turn)
+        else:
+            self._queue.append(turn)
+        try:
+            await turn
+        except asyncio.CancelledError:
+            if turn.done() and not turn.cancelled():
+                self._release()
+            raise
+
+    def _release(self) -> None:
+        while self._queue:
+            turn = self._queue.popleft()
+            if not turn.done():
+                turn.set_result(None)  # the line stays busy: it goes over to the next one
+                return
+        self._busy = False
+
+    # -- bytes --------------------------------------------------------------------------------------------------
+
+    def _transmit(self, packet: bytes) -> None:
+        if self._fd < 0:
+            raise DeviceLostError(self.port, "the port is not open", "Check the USB cable")
+        try:
+            written_n = os.write(self._fd, packet)
+        except BlockingIOError:
+            written_n = 0
+        except OSError as e:
+            error = DeviceLostError(self.port, f"writing failed ({e.strerror})", "Check the USB cable")
+            self._shut(error)
+            raise error from e
+        if written_n != len(packet):
+            raise DeviceTimeoutError(self.port, "the adapter takes no more bytes", "Unplug it and plug it in again")
+        if self._log is not None:
+            self._log(self._clock.now_s(), "tx", packet)
+
+    def _on_readable(self) -> None:
+        if self._fd < 0:
+            return
+        try:
+            data = os.read(self._fd, 4096)
+        except BlockingIOError:
+            return
+        except OSError as e:
+            self._shut(DeviceLostError(self.port, f"reading failed ({e.strerror})", "Check the USB cable"))
+            return
+        if not data:
+            self._shut(DeviceLostError(self.port, "the port vanished", "Check the USB cable"))
+            return
+        if self._log is not None:
+            self._log(self._clock.now_s(), "rx", data)
+        for packet in self._decoder.feed(data):
+            self._sort(packet)
+
+    def _sort(self, packet: Packet) -> None:
+        """Decide whether a packet is the reply that is waited for."""
+        counters, reply = self._counters, self._reply
+        if not packet.is_status:
+            counters["echo_n"] += 1
+        elif reply is None or reply.done():
+            counters["late_n"] += 1
+        elif packet.packet_id != self._wanted_id:
+            counters["foreign_n"] += 1
+        elif self._wanted_data_n is not None and len(packet.data) != self._wanted_data_n and not packet.error:
+            counters["late_n" if self._suspect else "invalid_n"] += 1
+        elif packet.error and self._suspect:
+            counters["late_n"] += 1  # a ping is never refused: this belongs to a former request
+        else:
+            counters["replies_n"] += 1
+            self.last_valid_s = self._clock.now_s()
+            reply.set_result(packet)
+
+
+def _describe(instruction: int, params: bytes) -> str:
+    name = (
+        Instruction(instruction).name.lower() if instruction in Instruction.__members__.values() else hex(instruction)
+    )
+    if instruction in (Instruction.READ, Instruction.WRITE, Instruction.REG_WRITE) and len(params) >= 2:
+        return f"{name} at address {params[0] | params[1] << 8}"
+    return name
