@@ -1,0 +1,179 @@
+"""The soil in the test bed: a height field whose mass is conserved and whose slopes settle to an angle of repose.
+
+Bed frame: x along the bed in the direction of travel, 0 at its start; y to the operator's left, 0 on the centre line;
+z up from the bed's floor, metres. The bed is 8 m x 2 m, as in section 3.3 of *Strategy for Motor Grader Blade Rotation
+considering Soil Distribution*; its floor and sides are plywood and let nothing through.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+BED_LENGTH_M = 8.0
+BED_WIDTH_M = 2.0
+REPOSE_DEG = 40.0
+"""Angle of repose of moist loam; sand has 30 to 35 degrees, moist earth 36 to 45."""
+
+_RATE = 0.35
+"""Share of a too steep step that moves in one pass over one direction; stable up to 0.5."""
+_NEIGHBOURS: tuple[tuple[tuple[slice, slice], tuple[slice, slice], float], ...] = (
+    ((slice(None, -1), slice(None)), (slice(1, None), slice(None)), 1.0),
+    ((slice(None), slice(None, -1)), (slice(None), slice(1, None)), 1.0),
+    ((slice(None, -1), slice(None, -1)), (slice(1, None), slice(1, None)), math.sqrt(2.0)),
+    ((slice(None, -1), slice(1, None)), (slice(1, None), slice(None, -1)), math.sqrt(2.0)),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A rectangle of cells, ``[x0, x1) x [y0, y1)``."""
+
+    x0: int
+    x1: int
+    y0: int
+    y1: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """For indexing a field array."""
+        return slice(self.x0, self.x1), slice(self.y0, self.y1)
+
+
+@dataclass(frozen=True, slots=True)
+class Wall:
+    """An obstacle inside a window: soil cannot enter its cells below its top.
+
+    ``mask``: window-shaped; ``flat``: the same as flat indices; ``top_m``: height of the top for each of ``flat``.
+    """
+
+    mask: BoolArray
+    flat: npt.NDArray[np.intp]
+    top_m: FloatArray
+
+
+class SoilField:
+    """Heights of loose soil above the bed's floor on a regular grid.
+
+    ``heights_m`` is ``(cells along x, cells along y)``; cell ``(i, j)`` has its centre at
+    ``((i + 0.5) cell_m, (j + 0.5) cell_m - width_m / 2)``. Every change of it conserves the sum, apart from
+    :meth:`add` and :meth:`clear`, which say what they add or take.
+    """
+
+    def __init__(
+        self,
+        *,
+        cell_m: float = 0.02,
+        length_m: float = BED_LENGTH_M,
+        width_m: float = BED_WIDTH_M,
+        repose_deg: float = REPOSE_DEG,
+        heights_m: FloatArray | None = None,
+    ) -> None:
+        self.cell_m = cell_m
+        self.length_m = length_m
+        self.width_m = width_m
+        self.repose_slope = math.tan(math.radians(repose_deg))
+        shape = (round(length_m / cell_m), round(width_m / cell_m))
+        if heights_m is not None and heights_m.shape != shape:
+            raise ValueError(f"heights have shape {heights_m.shape}, the bed has {shape} cells")
+        self.heights_m: FloatArray = np.zeros(shape) if heights_m is None else heights_m.astype(np.float64)
+        self.x_m: FloatArray = (np.arange(shape[0]) + 0.5) * cell_m
+        self.y_m: FloatArray = (np.arange(shape[1]) + 0.5) * cell_m - width_m / 2.0
+
+    @property
+    def volume_m3(self) -> float:
+        """All soil in the bed."""
+        return float(self.heights_m.sum()) * self.cell_m**2
+
+    def clear(self) -> None:
+        """Take all soil out."""
+        self.heights_m[:] = 0.0
+
+    def add(self, heights_m: FloatArray) -> None:
+        """Pour soil: ``heights_m`` (the field's shape, not negative) is added and settles over the whole bed."""
+        self.heights_m += heights_m
+        self.settle(self.whole)
+
+    @property
+    def whole(self) -> Window:
+        """The window of the whole bed."""
+        return Window(0, self.heights_m.shape[0], 0, self.heights_m.shape[1])
+
+    def window(self, x_min_m: float, x_max_m: float, y_min_m: float, y_max_m: float) -> Window:
+        """The cells touched by a rectangle in the bed frame, clipped to the bed; never empty."""
+        n_x, n_y = self.heights_m.shape
+        half = self.width_m / 2.0
+        x0 = min(max(math.floor(x_min_m / self.cell_m), 0), n_x - 2)
+        x1 = min(max(math.ceil(x_max_m / self.cell_m), x0 + 2), n_x)
+        y0 = min(max(math.floor((y_min_m + half) / self.cell_m), 0), n_y - 2)
+        y1 = min(max(math.ceil((y_max_m + half) / self.cell_m), y0 + 2), n_y)
+        return Window(x0, x1, y0, y1)
+
+    def relax(self, window: Window, wall: Wall | None = None, passes: int = 1) -> float:
+        """Let slopes steeper than the repose angle slide, ``passes`` times over the eight neighbour directions.
+
+        Soil climbs onto a ``wall`` only where it stands above the wall's top (it then lies in the wall's cells, for
+        the caller to carry on), and never leaves a wall's cell. Nothing crosses the window's border.
+
+        Returns:
+            The largest height moved between two cells in the last pass, metres: near zero once settled.
+        """
+        heights = self.heights_m[window.slices]
+        surface = heights
+        if wall is not None:
+            surface = heights.copy()
+            surface.reshape(-1)[wall.flat] = wall.top_m
+            free = ~wall.mask
+        drop_m = self.cell_m * self.repose_slope
+        largest = 0.0
+        for number in range(passes):
+            for upper, lower, distance in _NEIGHBOURS:
+                step = surface[upper] - surface[lower]
+                down = np.maximum(step - drop_m * distance, 0.0)
+                up = np.maximum(-step - drop_m * distance, 0.0)
+                if wall is not None:
+                    down *= free[upper]
+                    up *= free[lower]
+                down -= up
+                down *= _RATE
+                if number == passes - 1:
+                    largest = max(largest, float(np.abs(down).max(initial=0.0)))
+                heights[upper] -= down
+                heights[lower] += down
+                if wall is not None:
+                    surface = heights.copy()
+                    surface.reshape(-1)[wall.flat] = np.maximum(wall.top_m, heights.reshape(-1)[wall.flat])
+        return largest
+
+    def settle(self, window: Window, wall: Wall | None = None, tolerance_m: float = 2e-5, limit: int = 3000) -> None:
+        """Relax until nothing larger than ``tolerance_m`` moves (at most ``limit`` passes)."""
+        for _ in range(0, limit, 10):
+            if self.relax(window, wall, passes=10) < tolerance_m:
+                return
+
+    def deposit(self, window: Window, x_m: FloatArray, y_m: FloatArray, heights_m: FloatArray) -> None:
+        """Put columns of soil down at points of the bed, shared among the four cells around each.
+
+        Points outside the window go to its nearest cells. ``heights_m``: height of each column over one cell.
+        """
+        view = self.heights_m[window.slices]
+        n_x, n_y = view.shape
+        column_x = np.clip(x_m / self.cell_m - 0.5 - window.x0, 0.0, n_x - 1.001)
+        column_y = np.clip((y_m + self.width_m / 2.0) / self.cell_m - 0.5 - window.y0, 0.0, n_y - 1.001)
+        ix, iy = column_x.astype(np.intp), column_y.astype(np.intp)
+        fx, fy = column_x - ix, column_y - iy
+        flat = ix * n_y + iy
+        near, far = heights_m * (1.0 - fx), heights_m * fx
+        far_right = far * fy
+        near_right = near * fy
+        view += np.bincount(
+            np.concatenate((flat, flat + 1, flat + n_y, flat + n_y + 1)),
+            np.concatenate((near - near_right, near_right, far - far_right, far_right)),
+            minlength=n_x * n_y,
+        ).reshape(n_x, n_y)
