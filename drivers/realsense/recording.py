@@ -11,8 +11,10 @@ from graderd.hal.errors import DeviceMissingError, DeviceTimeoutError, Lifecycle
 from graderd.hal.settings import CameraSettings
 
 POLL_MS = 250
-WRAP_APART_S = 0.02
-"""A set whose colour and depth lie further apart in device time, at a place where numbers jump back, is torn."""
+APART_S = 0.02
+"""A set whose colour and depth lie further apart in device time is torn."""
+TORN_SHOWN_N = 5
+"""So many torn sets in a row are no accident of playing: they are handed out, and the health check names them."""
 
 
 class RecordingCamera:
@@ -22,7 +24,8 @@ class RecordingCamera:
     every frame as fast as it is read, which makes results repeatable.
 
     The end of a file looks like a camera that stalls; only the playback's status tells them apart. Where a repeated
-    recording starts over, the SDK pairs the last colour with the first depth picture: such sets are dropped.
+    recording starts over, or the reader is slow, the SDK may pair colour and depth of different moments: such sets are
+    dropped, and counted.
     """
 
     def __init__(self, settings: CameraSettings, real_time: bool = True) -> None:
@@ -33,6 +36,7 @@ class RecordingCamera:
         self._playback: sdk.Rs = None
         self._lenses: dict[str, Intrinsics] = {}
         self._last = (-1, -1)
+        self._torn_in_a_row_n = 0
         self.torn_dropped_n = 0
 
     @property
@@ -55,15 +59,17 @@ class RecordingCamera:
         config, pipeline = rs.config(), rs.pipeline()
         try:
             config.enable_device_from_file(where, repeat_playback=self._repeat)
-            profile = pipeline.start(config)
+            if not self._real_time:
+                # Said before the start, or the first frames are paced, and lost. (Said before a paced start, the
+                # pace counts from here, and frames are lost too.)
+                config.resolve(rs.pipeline_wrapper(pipeline)).get_device().as_playback().set_real_time(False)
+            playback = pipeline.start(config).get_device().as_playback()
         except RuntimeError as error:
             cause = " ".join(str(error).split())
             raise DeviceMissingError(
                 where, f"not a readable RealSense recording ({cause})", "Give a .db3 or .bag made by librealsense"
             ) from error
-        self._pipeline = pipeline
-        self._playback = profile.get_device().as_playback()
-        self._playback.set_real_time(self._real_time)
+        self._pipeline, self._playback = pipeline, playback
         self._last = (-1, -1)
 
     def read(self, timeout_s: float) -> Frame:
@@ -102,7 +108,10 @@ class RecordingCamera:
         numbers = (int(color.get_frame_number()), int(depth.get_frame_number()) if depth else -1)
         if self._is_torn(numbers, color, depth):
             self.torn_dropped_n += 1
-            return None
+            self._torn_in_a_row_n += 1
+            if self._torn_in_a_row_n < TORN_SHOWN_N:
+                return None
+        self._torn_in_a_row_n = 0
         self._last = numbers
         metadata = {"color_device_s": color.get_timestamp() / 1000.0}
         picture: DepthImage | None = None
@@ -122,12 +131,9 @@ class RecordingCamera:
         )
 
     def _is_torn(self, numbers: tuple[int, int], color: sdk.Rs, depth: sdk.Rs) -> bool:
-        color_back, depth_back = numbers[0] <= self._last[0], depth and numbers[1] <= self._last[1]
-        if not color_back and not depth_back:
-            return False
-        if depth and abs(color.get_timestamp() - depth.get_timestamp()) / 1000.0 > WRAP_APART_S:
-            return True
-        return numbers[0] == self._last[0] or (bool(depth) and numbers[1] == self._last[1])
+        if numbers[0] == self._last[0] or (depth and numbers[1] == self._last[1]):
+            return True  # one of the two was handed out before
+        return bool(depth) and abs(color.get_timestamp() - depth.get_timestamp()) / 1000.0 > APART_S
 
     def _lens(self, stream: str, frame: sdk.Rs) -> Intrinsics:
         if stream not in self._lenses:
