@@ -266,6 +266,9 @@ def _arm(
         return yes(state, f"already armed: {state.mode}")
     if state.arming_since_s is not None:
         return yes(state, "arming")
+    if inputs.devices_active:
+        # Arming writes and reads back limits and watchdogs; devices left active from before must not skip that.
+        return no("the devices are still being released", "arm again in a moment")
     fault = worst(inputs.faults)
     if fault is not None and fault.row.reaction >= Reaction.DISARM:
         return no(f"{fault.name}: {fault.row.reads}", fault.row.remedy)

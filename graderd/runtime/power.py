@@ -51,8 +51,9 @@ class PowerKeeper:
         await _finished(former)
         for name, device in self._devices.all().items():
             try:
-                if device.lifecycle is not Lifecycle.ACTIVE:
-                    await device.arm()
+                if device.lifecycle is Lifecycle.ACTIVE:
+                    await device.disarm()  # left over from before: arming anew writes and verifies everything
+                await device.arm()
             except DeviceError as error:
                 log.warning("arming %s failed: %s", name, error)
                 self._error = str(error)

@@ -11,6 +11,8 @@ import sys
 import time
 from pathlib import Path
 
+from graderd.runtime.app.devices import build_devices
+
 from graderd.api import make_app
 from graderd.api.server import serve
 from graderd.config import Config, ConfigError, load
@@ -18,7 +20,6 @@ from graderd.core import commands as cmd
 from graderd.core.machine import Mode
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
-from graderd.runtime.app.devices import build_devices
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.health import HealthWatch

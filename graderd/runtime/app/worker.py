@@ -14,13 +14,13 @@ from collections import deque
 from typing import BinaryIO
 
 import cv2
-from graderd.runtime.app.frame_sources import open_camera
 from pydantic import BaseModel, ValidationError
 
 from graderd.hal.camera import Camera, EndOfFrames, Frame
 from graderd.hal.errors import DeviceError, DeviceTimeoutError
 from graderd.hal.settings import CameraSettings
 from graderd.perception import Classifier, make_classifier
+from graderd.runtime.app.frame_sources import open_camera
 from graderd.runtime.worker_protocol import Angle, Observed, Opened, Preview, Start, ToChild, Trouble
 
 JPEG_QUALITY = 80
