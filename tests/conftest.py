@@ -7,6 +7,14 @@ import inspect
 from collections.abc import AsyncIterator
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# Loaded machines draw slowly: no test of ours may depend on that. The same examples every time, so that a green commit
+# stays green; the fuzz scripts under benchmarks/ look further with seeds of their own.
+settings.register_profile(
+    "graderd", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow], print_blob=True
+)
+settings.load_profile("graderd")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -27,9 +28,9 @@ def resolve(command: cmd.Jog | cmd.Preset, pose: Pose) -> tuple[Goals, ...] | st
     return (Goals(rotation_deg=command.value),) if abs(command.value) <= 60 else "beyond the limits"
 
 
-def inputs(*commands: cmd.Command, now_s: float = NOW_S, **changes: object) -> Inputs:
+def inputs(*commands: cmd.Command, now_s: float = NOW_S, **changes: Any) -> Inputs:
     base = Inputs(now_s=now_s, resolve=resolve, commands=commands, pose=POSE)
-    return replace(base, **changes)  # type: ignore[arg-type]
+    return replace(base, **changes)
 
 
 def fault(reaction: Reaction, axes: frozenset[str] = ALL_AXES, name: str = "camera.test") -> ActiveFault:
@@ -37,7 +38,7 @@ def fault(reaction: Reaction, axes: frozenset[str] = ALL_AXES, name: str = "came
     return ActiveFault(name, row, "detail", NOW_S - 0.6, True)
 
 
-def do(state: State, *commands: cmd.Command, **changes: object) -> Step:
+def do(state: State, *commands: cmd.Command, **changes: Any) -> Step:
     return step(state, inputs(*commands, **changes), SETTINGS, RULE)
 
 

@@ -1,0 +1,79 @@
+"""A mistake in the configuration names its place, its cause and what to write instead."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from graderd.config import Config, ConfigError, load, parse
+
+
+def problems(text: str, path: Path) -> list[str]:
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    return caught.value.problems
+
+
+def test_no_file_is_the_defaults() -> None:
+    assert parse({}) == Config()
+
+
+def test_an_unknown_key_names_line_and_nearest_right_one(tmp_path: Path) -> None:
+    path = tmp_path / "graderd.toml"
+    (problem,) = problems("# site 7\n[rotation]\nvelocty_deg_per_s = 20\n", path)
+    assert problem == f"{path}:3: rotation.velocty_deg_per_s: unknown key. Did you mean rotation.velocity_deg_per_s?"
+    (problem,) = problems("[rotaton]\nport = 'x'\n", path)
+    assert "Did you mean rotation?" in problem
+    (problem,) = problems("[perception.depth]\ncel_m = 0.01\n", path)
+    assert "Did you mean perception.depth.cell_m?" in problem
+
+
+def test_all_mistakes_at_once(tmp_path: Path) -> None:
+    found = problems("[rotation]\nbaud_n = -1\nservo_id_n = 300\n[can]\nbitrate_n = 'fast'\n", tmp_path / "g.toml")
+    assert len(found) == 3
+    assert all("g.toml:" in problem for problem in found)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[rotation]\nmin_deg = 10\nmax_deg = -10\n", "min_deg (10.0) must be below max_deg (-10.0)"),
+        ("[rule]\nleft_deg = 80\n", "rule.left_deg (80) lies outside gate"),
+        ("[lift_left]\naddress_n = 20\n", "four different addresses"),
+        ("[rule]\nleft_deg = nan\n", "finite"),
+        ("[control]\nshutdown_order = ['rotation']\n", "shutdown_order"),
+        ("version = 2\n", "version"),
+    ],
+)
+def test_values_that_make_no_sense_together(tmp_path: Path, text: str, said: str) -> None:
+    assert said in "\n".join(problems(text, tmp_path / "g.toml"))
+
+
+def test_unreadable_files(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load(tmp_path / "absent.toml")
+    path = tmp_path / "g.toml"
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match="not UTF-8"):
+        load(path)
+    assert "not valid TOML" in problems("[rotation\n", path)[0]
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=12), inner, max_size=3),
+    max_leaves=8,
+)
+sections = st.dictionaries(st.sampled_from([*Config.model_fields, "x"]), values, max_size=4)
+
+
+@given(sections)
+def test_nonsense_never_raises_anything_else(data: dict[str, object]) -> None:
+    try:
+        parse(data)
+    except ConfigError as error:
+        assert error.problems
