@@ -69,10 +69,13 @@ async def serve(
             servers.append(_Server(_config(guarded, limits), listener))
         tasks = [asyncio.create_task(server.run_until_told(), name=f"api server {server.name}") for server in servers]
         try:
-            await asyncio.gather(*(server.answering.wait() for server in servers))
+            for server in servers:
+                await server.answering.wait()
             if ready is not None:
                 ready.set()
-            await asyncio.gather(*tasks)
+            ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in ended:
+                task.result()
         finally:
             app.state.closing.set()
             for server in servers:

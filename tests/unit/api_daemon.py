@@ -104,7 +104,7 @@ class FakeDaemon:
             resolve=self._resolve,
             commands=tuple(command for command, _ in taken),
             pose=self._pose(),
-            settled=not self._moving,
+            settled=not self._moving and not any(isinstance(command, cmd.Preset) for command, _ in taken),
             devices_active=self._active,
             unmet=self.unmet,
             faults=self.faults,
@@ -221,10 +221,9 @@ class FakeDaemon:
             presets=("transport",),
         )
 
-    @property
-    def mode(self) -> Mode:
-        """The present mode."""
-        return self.state.mode
+    async def until_mode(self, mode: Mode) -> None:
+        """Wait for ``mode``."""
+        await self.until(lambda: self.state.mode is mode)
 
     async def until(self, condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
         """Wait, tick by tick, for ``condition``."""

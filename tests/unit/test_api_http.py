@@ -41,7 +41,7 @@ async def test_status_is_the_status_model(tmp_path: Path) -> None:
         answer = await client.get("/v1/status")
         assert answer.status_code == 200
         assert Status.model_validate_json(answer.content).axes["rotation"].measured == 0.0
-        assert daemon.mode is Mode.DISARMED
+        assert daemon.status().mode is Mode.DISARMED
 
 
 async def test_the_way_through_the_modes(tmp_path: Path) -> None:
@@ -50,14 +50,14 @@ async def test_the_way_through_the_modes(tmp_path: Path) -> None:
             answer = await client.post("/v1/commands", json={"command": command})
             assert answer.status_code == 200, answer.text
             assert answer.json()["accepted"] is True
-            await daemon.until(lambda mode=mode: daemon.mode is mode)
+            await daemon.until_mode(mode)
         assert (await client.post("/v1/stop", json={"reason": "test"})).json()["message"] == "stopped"
-        assert daemon.mode is Mode.STOPPED
+        assert daemon.status().mode is Mode.STOPPED
         refused = await client.post("/v1/commands", json={"command": "arm"})
         assert refused.status_code == 409
         assert refused.json() == {"error": "stopped: test", "where": "arm", "remedy": "reset first, then arm"}
         assert (await client.post("/v1/commands", json={"command": "reset"})).status_code == 200
-        assert daemon.mode is Mode.DISARMED
+        assert daemon.status().mode is Mode.DISARMED
 
 
 @pytest.mark.parametrize("body", [None, {}, {"reason": "x", "client": "y"}])
@@ -66,7 +66,7 @@ async def test_stop_needs_no_body_and_may_be_repeated(tmp_path: Path, body: dict
         for _ in range(3):
             answer = await client.post("/v1/stop") if body is None else await client.post("/v1/stop", json=body)
             assert answer.status_code == 200, answer.text
-        assert daemon.mode is Mode.STOPPED
+        assert daemon.status().mode is Mode.STOPPED
 
 
 async def test_arm_says_what_is_unmet_and_the_remedy(tmp_path: Path) -> None:

@@ -1,0 +1,88 @@
+"""The command line's root: global options, all commands, and how errors and exit codes come out."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer import Abort, TyperException
+
+from graderd.cli.console import CliError, ExitCode, print_error, print_text
+from graderd.hal.errors import DeviceError
+
+COMMANDS = (
+    "run",
+    "demo",
+    "rig",
+    "guard",
+    "status",
+    "modes",
+    "jog",
+    "preset",
+    "explain",
+    "config",
+    "rotation",
+    "profile",
+    "can",
+    "classify",
+    "calibrate",
+)
+
+
+def make_cli() -> typer.Typer:
+    """The whole command line."""
+    app = typer.Typer(
+        name="graderd",
+        help="Runs a motor grader's blade by what a camera sees.",
+        epilog="Exit status: 0 done, 1 refused or failed, 2 bad usage, 3 no daemon.",
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["--help", "-h"]},
+    )
+
+    @app.callback(invoke_without_command=True)
+    def root(
+        context: typer.Context,
+        socket: Annotated[
+            Path | None,
+            typer.Option(
+                help="The daemon's socket. Default: $GRADERD_SOCKET, else /run/graderd/graderd.sock, else "
+                "$XDG_RUNTIME_DIR/graderd/graderd.sock.",
+            ),
+        ] = None,
+    ) -> None:
+        context.obj = socket
+        if context.invoked_subcommand is None:
+            print_text(context.get_help())
+            raise typer.Exit(ExitCode.USAGE)
+
+    for name in COMMANDS:
+        if find_spec(f"graderd.cli.{name}") is not None:
+            import_module(f"graderd.cli.{name}").register(app)
+    return app
+
+
+def run_app(arguments: list[str]) -> int:
+    """Run the command line with ``arguments`` and return the exit status."""
+    as_json = "--json" in arguments
+    try:
+        result = make_cli()(arguments, prog_name="graderd", standalone_mode=False)
+    except CliError as error:
+        print_error(error.where, error.cause, error.remedy, as_json)
+        return error.exit_code
+    except DeviceError as error:
+        print_error(error.where, error.cause, error.remedy, as_json)
+        return ExitCode.FAILED
+    except TyperException as error:
+        context = getattr(error, "ctx", None)
+        path = context.command_path if context is not None else "graderd"
+        where = path.removeprefix("graderd").strip()
+        print_error(where, error.format_message(), f"See '{path} --help'", as_json)
+        return ExitCode.USAGE if error.exit_code == ExitCode.USAGE else ExitCode.FAILED
+    except Abort:
+        return ExitCode.FAILED
+    except BrokenPipeError:
+        return ExitCode.FAILED
+    return result if isinstance(result, int) else ExitCode.OK

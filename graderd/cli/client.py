@@ -1,0 +1,207 @@
+"""The daemon as the command line sees it: requests and WebSockets over the unix socket.
+
+Requests use the standard library alone: ``graderd stop`` shall not wait for large imports.
+"""
+
+from __future__ import annotations
+
+import errno
+import getpass
+import http.client
+import json
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+from urllib.parse import quote, urlencode
+
+import typer
+
+from graderd.cli.console import CliError, ExitCode
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
+
+SYSTEM_SOCKET = Path("/run/graderd/graderd.sock")
+TIMEOUT_S = 5.0
+BUSY_RETRY_S = 3.0
+
+
+def default_socket() -> Path:
+    """$GRADERD_SOCKET, else the service's socket, else the one of a daemon this user runs."""
+    named = os.environ.get("GRADERD_SOCKET")
+    if named:
+        return Path(named)
+    own = os.environ.get("XDG_RUNTIME_DIR")
+    if own and not SYSTEM_SOCKET.exists():
+        return Path(own) / "graderd" / "graderd.sock"
+    return SYSTEM_SOCKET
+
+
+def client_name() -> str:
+    """Who asks, for the daemon's records: the user."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return f"uid {os.getuid()}"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One answer of the daemon."""
+
+    status_code: int
+    body: bytes
+
+    def json(self) -> Any:
+        """The body, decoded."""
+        return json.loads(self.body)
+
+
+class Daemon:
+    """A client of the daemon's interface."""
+
+    def __init__(self, socket_path: Path) -> None:
+        self.socket_path = socket_path
+
+    def get(self, path: str) -> Any:
+        """The JSON answer to GET ``path``.
+
+        Raises:
+            CliError: no daemon, or it refused.
+        """
+        return self._checked(self._request("GET", path))
+
+    def post(self, path: str, body: Any = None, timeout_s: float = TIMEOUT_S) -> Any:
+        """The JSON answer to POST ``path``.
+
+        Raises:
+            CliError: no daemon, or it refused.
+        """
+        return self._checked(self._request("POST", path, body, timeout_s))
+
+    def command(self, command: str, **arguments: Any) -> dict[str, Any]:
+        """Send a command and return the reply.
+
+        Raises:
+            CliError: no daemon, or it refused.
+        """
+        body = {"command": command, "client": client_name(), **arguments}
+        return cast("dict[str, Any]", self.post("/v1/commands", body))
+
+    def service(self, name: str, timeout_s: float, **arguments: Any) -> dict[str, Any]:
+        """Run a device service and return what it found.
+
+        Raises:
+            CliError: no daemon, or it refused or failed.
+        """
+        return cast("dict[str, Any]", self.post(f"/v1/services/{quote(name)}", arguments, timeout_s))
+
+    @contextmanager
+    def websocket(self, path: str, **query: str | float) -> Iterator[ClientConnection]:
+        """An open WebSocket.
+
+        Raises:
+            CliError: no daemon, or it refused.
+        """
+        from websockets.exceptions import ConnectionClosed, InvalidHandshake
+        from websockets.sync.client import unix_connect
+
+        uri = f"ws://localhost{path}?{urlencode(query)}" if query else f"ws://localhost{path}"
+        try:
+            # `legacy` pins what the call returns: a connection, whatever the library's default becomes.
+            connection = unix_connect(
+                str(self.socket_path), uri, compression=None, proxy=None, open_timeout=TIMEOUT_S, legacy=True
+            )
+        except OSError as error:
+            raise self._unreachable(error) from error
+        except InvalidHandshake as error:
+            raise CliError(path, f"the daemon refused the stream: {error}", "try again when others are done") from error
+        try:
+            with connection:
+                yield connection
+        except ConnectionClosed as error:
+            raise CliError("daemon", "it closed the connection", "see graderd status") from error
+
+    def _request(self, method: str, path: str, body: Any = None, timeout_s: float = TIMEOUT_S) -> Answer:
+        payload = None if body is None else json.dumps(body, allow_nan=False)
+        headers = {} if payload is None else {"Content-Type": "application/json"}
+        give_up_s = time.monotonic() + BUSY_RETRY_S
+        while True:
+            connection = _UnixConnection(self.socket_path, timeout_s)
+            try:
+                connection.request(method, path, payload, headers)
+                response = connection.getresponse()
+                return Answer(response.status, response.read())
+            except (OSError, http.client.HTTPException) as error:
+                if not _worth_retrying(error, path) or time.monotonic() > give_up_s:
+                    raise self._unreachable(error) from error
+            finally:
+                connection.close()
+            time.sleep(0.02)
+
+    def _checked(self, answer: Answer) -> Any:
+        try:
+            content = answer.json()
+        except ValueError as error:
+            raise CliError(
+                str(self.socket_path), "what answers is not graderd", "see --socket", ExitCode.NO_DAEMON
+            ) from error
+        if answer.status_code >= 400:
+            problem = content if isinstance(content, dict) else {}
+            raise CliError(
+                str(problem.get("where", "")),
+                str(problem.get("error", f"HTTP {answer.status_code}")),
+                str(problem.get("remedy", "")),
+            )
+        return content
+
+    def _unreachable(self, error: Exception) -> CliError:
+        where = str(self.socket_path)
+        if isinstance(error, FileNotFoundError | ConnectionRefusedError):
+            return CliError(
+                where,
+                "no daemon serves this socket",
+                "start it with 'graderd run' or 'systemctl start graderd', or name its socket with --socket",
+                ExitCode.NO_DAEMON,
+            )
+        if isinstance(error, PermissionError):
+            return CliError(
+                where, "this user may not use the daemon's socket", "join its group (graderd)", ExitCode.NO_DAEMON
+            )
+        if isinstance(error, TimeoutError):
+            return CliError(where, "the daemon did not answer in time", "see its log", ExitCode.NO_DAEMON)
+        return CliError(where, f"the daemon cannot be reached: {error}", "see its log", ExitCode.NO_DAEMON)
+
+
+class _UnixConnection(http.client.HTTPConnection):
+    """HTTP over a unix socket."""
+
+    def __init__(self, path: Path, timeout_s: float) -> None:
+        super().__init__("localhost", timeout=timeout_s)
+        self._path = path
+
+    def connect(self) -> None:
+        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.sock.settimeout(self.timeout)
+        self.sock.connect(str(self._path))
+
+
+def _worth_retrying(error: Exception, path: str) -> bool:
+    """A flooded daemon's queue is full for a moment, or it made room by dropping us. Commands are safe to repeat: each
+    names a state, and jogs do not come this way. A service may have begun: it is repeated only if it never got in."""
+    if isinstance(error, OSError) and error.errno == errno.EAGAIN:
+        return True
+    dropped = isinstance(error, ConnectionResetError | BrokenPipeError | http.client.RemoteDisconnected)
+    return dropped and not path.startswith("/v1/services/")
+
+
+def daemon_of(context: typer.Context) -> Daemon:
+    """The daemon the global options name."""
+    options = context.find_root().obj
+    path = options if isinstance(options, Path) else default_socket()
+    return Daemon(path)

@@ -1,0 +1,104 @@
+"""How commands speak: text for people, one JSON object for programs, one line on stderr where something failed."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+Row = Sequence[str]
+
+
+class ExitCode(IntEnum):
+    """What the command's exit status says."""
+
+    OK = 0
+    FAILED = 1
+    USAGE = 2
+    NO_DAEMON = 3
+
+
+class CliError(Exception):
+    """A command ends with this one line and exit code."""
+
+    def __init__(self, where: str, cause: str, remedy: str = "", exit_code: ExitCode = ExitCode.FAILED) -> None:
+        super().__init__(where, cause, remedy)
+        self.where = where
+        self.cause = cause
+        self.remedy = remedy
+        self.exit_code = exit_code
+
+
+def error_line(where: str, cause: str, remedy: str = "") -> str:
+    """``graderd: WHERE: why. What to do``, in one line whatever the parts contain."""
+    head = f"graderd: {where}: {cause}" if where else f"graderd: {cause}"
+    text = f"{head.rstrip('.')}. {remedy}" if remedy else head
+    return " ".join(text.split())
+
+
+def print_error(where: str, cause: str, remedy: str, as_json: bool) -> None:
+    """The line on stderr; with ``--json`` the same as an object on stdout."""
+    typer.echo(error_line(where, cause, remedy), err=True)
+    if as_json:
+        print_json({"error": cause, "where": where, "remedy": remedy})
+
+
+def print_json(value: Any) -> None:
+    """One JSON object on one line, flushed: a program may be reading line by line."""
+    sys.stdout.write(json.dumps(value, ensure_ascii=False, allow_nan=False) + "\n")
+    sys.stdout.flush()
+
+
+def print_text(text: str) -> None:
+    """A line for people."""
+    typer.echo(text)
+
+
+def for_people() -> bool:
+    """Whether a person looks at a terminal (colours, tables), or a pipe wants plain lines."""
+    return sys.stdout.isatty()
+
+
+def print_table(title: str, header: Row, rows: Sequence[Row]) -> None:
+    """A table: ruled and coloured on a terminal, else aligned columns."""
+    if for_people():
+        print_rich(rich_table(title, header, rows))
+        return
+    print_text(plain_table(title, header, rows))
+
+
+def print_rich(*things: RenderableType) -> None:
+    """Render on the terminal."""
+    from rich.console import Console
+
+    Console().print(*things)
+
+
+def rich_table(title: str, header: Row, rows: Sequence[Row]) -> RenderableType:
+    """The table for a terminal. Cells are texts, never markup: they may carry a device's own words."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title or None, title_justify="left", title_style="bold", box=SIMPLE_HEAD, pad_edge=False)
+    for name in header:
+        table.add_column(name)
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    return table
+
+
+def plain_table(title: str, header: Row, rows: Sequence[Row]) -> str:
+    """The table as aligned text."""
+    lines = [tuple(header), *(tuple(row) for row in rows)] if any(header) else [tuple(row) for row in rows]
+    widths = [max((len(line[column]) for line in lines), default=0) for column in range(len(header))]
+    body = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
+    return "\n".join([title, *(f"  {line}" for line in body)] if title else body)

@@ -1,0 +1,115 @@
+"""``graderd arm | disarm | stop | reset | auto | manual``: from one mode to the other."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated, Any
+
+import typer
+
+from graderd.cli.client import Daemon, client_name, daemon_of
+from graderd.cli.console import CliError, Json, print_json, print_table, print_text
+from graderd.cli.epilog import example
+
+ARMING_S = 8.0
+POLL_S = 0.05
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+
+    @app.command(epilog=example("graderd arm && graderd auto"))
+    def arm(context: typer.Context, json: Json = False) -> None:
+        """Power the devices and hold. Lists what is met and what is not, and refuses while anything needed is not."""
+        daemon = daemon_of(context)
+        refusal: CliError | None = None
+        try:
+            daemon.command("arm")
+            status = _after_arming(daemon)
+        except CliError as error:
+            if error.where != "arm":
+                raise
+            refusal, status = error, daemon.get("/v1/status")
+        readiness = status["readiness"]
+        if json:
+            if refusal is None:
+                print_json({"command": "arm", "mode": status["mode"], "readiness": readiness})
+        else:
+            _print_readiness(readiness)
+        if refusal is not None:
+            raise refusal
+        if not json:
+            print_text(f"armed: {status['mode']}")
+
+    @app.command(epilog=example("graderd disarm"))
+    def disarm(context: typer.Context, json: Json = False) -> None:
+        """Hold, then take power away as configured."""
+        _send(context, "disarm", json)
+
+    @app.command(epilog=example("graderd stop --reason 'person near the blade'"))
+    def stop(
+        context: typer.Context,
+        reason: Annotated[str, typer.Option(help="Kept as the reason of the stop.")] = "stop command",
+        json: Json = False,
+    ) -> None:
+        """End motion at once. Wins over everything and stays until reset."""
+        try:
+            body = {"client": client_name()[:80], "reason": reason[:200]}
+            _tell(daemon_of(context).post("/v1/stop", body), json)
+        except CliError as error:
+            remedy = f"{error.remedy}. If the blade moves, use the emergency stop"
+            raise CliError(error.where, error.cause, remedy, error.exit_code) from error
+
+    @app.command(epilog=example("graderd reset && graderd arm"))
+    def reset(context: typer.Context, json: Json = False) -> None:
+        """Leave the latched stop for disarmed."""
+        _send(context, "reset", json)
+
+    @app.command(epilog=example("graderd auto"))
+    def auto(context: typer.Context, json: Json = False) -> None:
+        """Let the rule turn the blade by what the camera sees."""
+        _send(context, "auto", json)
+
+    @app.command(epilog=example("graderd manual && graderd jog rotate +5deg"))
+    def manual(context: typer.Context, json: Json = False) -> None:
+        """Hold and take jogs."""
+        _send(context, "manual", json)
+
+
+def _send(context: typer.Context, command: str, as_json: bool) -> None:
+    _tell(daemon_of(context).command(command), as_json)
+
+
+def _tell(reply: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print_json(reply)
+    else:
+        print_text(reply["message"])
+
+
+def _after_arming(daemon: Daemon) -> dict[str, Any]:
+    """Status once arming has ended.
+
+    Raises:
+        CliError: it ended elsewhere than armed.
+    """
+    give_up_s = time.monotonic() + ARMING_S
+    while True:
+        status: dict[str, Any] = daemon.get("/v1/status")
+        if status["mode"] in ("manual", "auto"):
+            return status
+        if not status["arming"]:
+            raise CliError("arm", status["reason"], "see graderd status")
+        if time.monotonic() > give_up_s:
+            raise CliError("arm", f"still arming after {ARMING_S:g} s", "see graderd status")
+        time.sleep(POLL_S)
+
+
+def _print_readiness(readiness: list[dict[str, Any]]) -> None:
+    def verdict(requirement: dict[str, Any]) -> str:
+        if requirement["met"]:
+            return "met"
+        return "UNMET" if requirement["mandatory"] else "unmet (may be)"
+
+    rows = [(verdict(r), r["name"], r["reason"], r["remedy"]) for r in readiness]
+    print_table("Readiness", ("", "requirement", "reason", "remedy"), rows)

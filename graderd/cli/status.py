@@ -1,0 +1,170 @@
+"""``graderd status``: everything at one moment, or as it changes."""
+
+from __future__ import annotations
+
+import json as json_module
+import time
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+import typer
+
+from graderd.cli.client import Daemon, daemon_of
+from graderd.cli.console import (
+    Json,
+    Row,
+    for_people,
+    plain_table,
+    print_json,
+    print_rich,
+    print_text,
+    rich_table,
+)
+from graderd.cli.epilog import example
+
+Section = tuple[str, Row, list[Row]]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+
+    @app.command(
+        epilog=example("graderd status", "graderd status --watch", "graderd status --json | jq .axes.rotation")
+    )
+    def status(
+        context: typer.Context,
+        watch: Annotated[bool, typer.Option("--watch", help="Go on showing it until Ctrl-C.")] = False,
+        json: Json = False,
+    ) -> None:
+        """Show mode, axes, soil, faults, readiness and health."""
+        daemon = daemon_of(context)
+        if watch:
+            _watch(daemon, json)
+            return
+        state = daemon.get("/v1/status")
+        if json:
+            print_json(state)
+        elif for_people():
+            print_rich(*(rich_table(*section) for section in sections(state)))
+        else:
+            print_text("\n".join(plain_table(*section) for section in sections(state)))
+
+
+def _watch(daemon: Daemon, as_json: bool) -> None:
+    """A live table on a terminal, else one line or object per change of second."""
+    try:
+        if as_json or not for_people():
+            for state in _stream(daemon, 10.0 if as_json else 1.0):
+                if as_json:
+                    print_json(state)
+                else:
+                    print_text(summary(state))
+            return
+        from rich.console import Group
+        from rich.live import Live
+
+        with Live(auto_refresh=False, screen=True) as live:
+            for state in _stream(daemon, 10.0):
+                live.update(Group(*(rich_table(*section) for section in sections(state))), refresh=True)
+    except KeyboardInterrupt:
+        return
+
+
+def _stream(daemon: Daemon, rate_hz: float) -> Iterator[dict[str, Any]]:
+    with daemon.websocket("/v1/stream", rate_hz=rate_hz) as stream:
+        while True:
+            yield json_module.loads(stream.recv())
+
+
+def summary(state: dict[str, Any]) -> str:
+    """One line: mode, reason, angle, soil, faults."""
+    rotation = state["axes"].get("rotation", {})
+    faults = ", ".join(fault["name"] for fault in state["faults"]) or "none"
+    return (
+        f"{time.strftime('%H:%M:%S')} {state['mode']} ({state['reason']}) soil {state['soil']['zone']} "
+        f"rotation {_number(rotation.get('requested'), 'deg')} -> {_number(rotation.get('measured'), 'deg')} "
+        f"faults {faults}"
+    )
+
+
+def sections(state: dict[str, Any]) -> list[Section]:
+    """The status as titled tables; empty ones are left out."""
+    where = "simulated" if state["simulated"] else "machine"
+    lease = state["lease"]
+    overview = [
+        ("mode", f"{state['mode']}{' (arming)' if state['arming'] else ''}: {state['reason']}"),
+        *(("holding", reason) for reason in state["holding"]),
+        *([("last stop", state["last_stop"])] if state["last_stop"] else []),
+        *([("moved by", f"{lease['client']} for {lease['remaining_s']:.1f} s more")] if lease else []),
+        ("soil", _soil(state["soil"])),
+        ("decision", _decision(state["decision"])),
+        ("blade", _attitude(state["attitude"])),
+        ("camera", _camera(state["camera"])),
+        ("tick", _tick(state["tick"])),
+    ]
+    found: list[Section] = [(f"graderd {state['version']} ({where})", ("", ""), [tuple(row) for row in overview])]
+    header = ("axis", "state", "requested", "limited", "sent", "measured", "age", "current", "temp.", "notes")
+    found.append(("Axes", header, [_axis(axis) for axis in state["axes"].values()]))
+    faults: list[Row] = [
+        (f["name"], f["reaction"], f["reads"], f["detail"], f["remedy"], f"clears {f['clears']}")
+        for f in state["faults"]
+    ]
+    if faults:
+        found.append(("Faults", ("fault", "reaction", "what", "detail", "what to do", ""), faults))
+    unmet: list[Row] = [(r["name"], r["reason"], r["remedy"]) for r in state["readiness"] if not r["met"]]
+    if unmet:
+        found.append(("Not ready to arm", ("requirement", "reason", "remedy"), unmet))
+    return found
+
+
+def _axis(axis: dict[str, Any]) -> Row:
+    unit = axis["unit"]
+    notes = [axis["limited_because"], *axis["flags"]]
+    if axis["moving"]:
+        notes.append("moving")
+    if axis["thermal_load"]:
+        notes.append(f"thermal load {axis['thermal_load']:.0%}")
+    return (
+        axis["name"],
+        axis["lifecycle"],
+        _number(axis["requested"], unit),
+        _number(axis["limited"], unit),
+        _number(axis["sent"], unit),
+        _number(axis["measured"], unit),
+        _number(axis["measured_age_s"], "s", 2),
+        _number(axis["current_a"], "A"),
+        _number(axis["temperature_c"], "°C", 0),
+        ", ".join(note for note in notes if note),
+    )
+
+
+def _soil(soil: dict[str, Any]) -> str:
+    shares = f"left {soil['share_left']:.0%}, center {soil['share_center']:.0%}, right {soil['share_right']:.0%}"
+    age = _number(soil["age_s"], "s old", 2)
+    return f"{soil['zone']} ({soil['confidence']:.0%} sure; {shares}; {age}; {soil['reason']})"
+
+
+def _decision(decision: dict[str, Any]) -> str:
+    if decision["zone"] is None:
+        return decision["reason"] or "none yet"
+    return f"soil {decision['zone']}: {_number(decision['angle_deg'], 'deg')}"
+
+
+def _attitude(attitude: dict[str, Any]) -> str:
+    return (
+        f"height {_number(attitude['height_mm'], 'mm', 0)}, slope {_number(attitude['slope_deg'], 'deg')}, "
+        f"pitch {_number(attitude['pitch_deg'], 'deg')}"
+    )
+
+
+def _camera(camera: dict[str, Any]) -> str:
+    restarts = f", restarted {camera['restarts_n']} times" if camera["restarts_n"] else ""
+    return f"{camera['lifecycle']} {camera['description']}{restarts}".strip()
+
+
+def _tick(tick: dict[str, Any]) -> str:
+    return f"{tick['rate_hz']:.0f} Hz, p99 {tick['lateness_p99_ms']:.1f} ms late, {tick['overruns_n']} overruns"
+
+
+def _number(value: float | None, unit: str, digits: int = 1) -> str:
+    return "-" if value is None else f"{value:.{digits}f} {unit}"

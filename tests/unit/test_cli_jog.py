@@ -1,0 +1,191 @@
+"""Jogging from the command line: values, arrival, refusals, and what is left when the command dies."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+from pathlib import Path
+
+import pytest
+
+from graderd.api.settings import ApiLimits
+from graderd.cli.console import CliError
+from graderd.cli.jog import JogValue, parse_value
+from graderd.core.machine import Mode
+from tests.unit.api_daemon import FakeDaemon, serving
+from tests.unit.test_cli_modes import Capture, cli, command_line
+
+
+@pytest.mark.parametrize(
+    ("axis", "text", "expected"),
+    [
+        ("rotate", "+5deg", JogValue(5.0, True)),
+        ("rotate", "-5deg", JogValue(-5.0, True)),
+        ("rotate", "30deg", JogValue(30.0, False)),
+        ("rotate", "=30deg", JogValue(30.0, False)),
+        ("rotate", "=-30deg", JogValue(-30.0, False)),
+        ("rotate", "=+30.5°", JogValue(30.5, False)),
+        ("lift", "+20mm", JogValue(20.0, True)),
+        ("height", ".5 mm", JogValue(0.5, False)),
+        ("pitch", "-1.25deg", JogValue(-1.25, True)),
+    ],
+)
+def test_values(axis: str, text: str, expected: JogValue) -> None:
+    assert parse_value(axis, text) == expected
+
+
+@pytest.mark.parametrize(
+    ("axis", "text", "says"),
+    [
+        ("rotate", "5mm", "its unit is deg, not mm"),
+        ("lift", "+5deg", "its unit is mm, not deg"),
+        ("lift", "5", "has no unit"),
+        ("rotate", "deg", "is no value"),
+        ("rotate", "", "is no value"),
+        ("rotate", "nandeg", "is no value"),
+        ("rotate", "infdeg", "is no value"),
+        ("rotate", "--5deg", "is no value"),
+        ("rotate", "1e3deg", "is no value"),
+        ("rotate", "5 5deg", "is no value"),
+    ],
+)
+def test_what_is_no_value(axis: str, text: str, says: str) -> None:
+    with pytest.raises(CliError) as error:
+        parse_value(axis, text)
+    assert says in error.value.cause
+    assert error.value.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("axis", "value", "moved", "ends_at"),
+    [
+        ("rotate", "+5deg", "rotation", 5.0),
+        ("rotate", "-5deg", "rotation", -5.0),
+        ("rotate", "=-12deg", "rotation", -12.0),
+        ("lift", "+20mm", "lift_right", 120.0),
+        ("height", "40mm", "lift_left", 140.0),
+        ("tilt", "60mm", "tilt", 60.0),
+        ("pitch", "-3deg", "tilt", 40.0),
+        ("slope", "2deg", "lift_left", 114.0),
+    ],
+)
+async def test_a_jog_ends_on_arrival_and_gives_the_lease_back(
+    tmp_path: Path, capsys: Capture, axis: str, value: str, moved: str, ends_at: float
+) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        assert await cli(path, "arm") == 0
+        capsys.readouterr()
+        assert await cli(path, "jog", axis, value, "--json") == 0
+        result = json.loads(capsys.readouterr().out)
+        assert result["arrived"] is True
+        assert result["measured"][moved] == pytest.approx(ends_at, abs=0.01)
+        assert daemon.positions[moved] == pytest.approx(ends_at)
+        assert daemon.state.lease is None
+        assert daemon.state.reason == "released"
+
+
+@pytest.mark.parametrize(
+    ("mode", "arguments", "says"),
+    [
+        (None, ["jog", "rotate", "+5deg"], "arm first"),
+        ("auto", ["jog", "rotate", "+5deg"], "send manual first"),
+        ("manual", ["jog", "rotate", "100deg"], "beyond the limit of +60.0 deg"),
+        ("manual", ["preset", "moon"], "there is no preset 'moon'"),
+    ],
+)
+async def test_refused_jogs_move_nothing(
+    tmp_path: Path, capsys: Capture, mode: str | None, arguments: list[str], says: str
+) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        if mode is not None:
+            assert await cli(path, "arm") == 0
+            assert await cli(path, mode) == 0
+        before = dict(daemon.positions)
+        capsys.readouterr()
+        assert await cli(path, *arguments) == 1
+        said = capsys.readouterr().err
+        assert says in said
+        assert said.count("\n") == 1
+        assert daemon.positions == before
+
+
+async def test_the_lease_is_kept_for_as_long_as_asked(tmp_path: Path, capsys: Capture) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        assert await cli(path, "arm") == 0
+        daemon.seen.clear()
+        assert await cli(path, "jog", "rotate", "+1deg", "--hold-s", "1") == 0
+        assert 6 <= sum(command.command == "renew" for command in daemon.seen) <= 11
+        assert "rotation 1.0 deg" in capsys.readouterr().out
+
+
+async def test_a_preset_goes_through_its_stages(tmp_path: Path, capsys: Capture) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        daemon.positions["rotation"] = 20.0
+        assert await cli(path, "arm") == 0
+        assert await cli(path, "preset") == 0
+        assert "transport" in capsys.readouterr().out
+        assert await cli(path, "preset", "transport") == 0
+        assert daemon.positions["lift_left"] == pytest.approx(200.0)
+        assert daemon.positions["rotation"] == pytest.approx(0.0)
+
+
+async def test_a_second_client_is_refused_while_the_first_moves(tmp_path: Path, capsys: Capture) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        assert await cli(path, "arm") == 0
+        daemon.hold_lease("somebody else")
+        assert await cli(path, "jog", "rotate", "+5deg") == 1
+        assert "somebody else is moving the blade" in capsys.readouterr().err
+
+
+async def test_a_stop_ends_the_jog_and_the_command_says_why(tmp_path: Path, capsys: Capture) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        assert await cli(path, "arm") == 0
+        jog = asyncio.create_task(cli(path, "jog", "rotate", "+50deg", "--hold-s", "20"), name="jog")
+        await daemon.until(lambda: daemon.state.lease is not None)
+        assert await cli(path, "stop", "--reason", "enough") == 0
+        assert await asyncio.wait_for(jog, 10) == 1
+        said = capsys.readouterr().err
+        assert "stopped, enough" in said
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+async def test_the_blade_holds_when_the_command_dies(tmp_path: Path, how: signal.Signals) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        assert await cli(path, "arm") == 0
+        process = await asyncio.create_subprocess_exec(
+            *command_line(path, "jog", "rotate", "+30deg", "--hold-s", "50"), stdout=asyncio.subprocess.DEVNULL
+        )
+        await daemon.until(lambda: daemon.state.lease is not None, timeout_s=30)
+        process.send_signal(how)
+        await daemon.until(lambda: daemon.state.lease is None)
+        stood = dict(daemon.positions)
+        await process.wait()
+        assert daemon.status().mode is Mode.MANUAL
+        assert daemon.state.reason == "released"
+        assert daemon.positions == stood
+
+
+async def test_a_stalled_client_loses_its_lease(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        assert await cli(path, "arm") == 0
+        process = await asyncio.create_subprocess_exec(
+            *command_line(path, "jog", "rotate", "+50deg", "--hold-s", "50"), stderr=asyncio.subprocess.PIPE
+        )
+        await daemon.until(lambda: daemon.state.lease is not None, timeout_s=30)
+        process.send_signal(signal.SIGSTOP)
+        await daemon.until(lambda: daemon.state.lease is None)
+        assert "lapsed" in daemon.state.reason
+        stood = dict(daemon.positions)
+        process.send_signal(signal.SIGCONT)
+        _, said = await asyncio.wait_for(process.communicate(), 10)
+        assert process.returncode == 1
+        assert b"lapsed" in said
+        assert daemon.positions == stood
+
+
+async def test_a_frozen_daemon_is_told(tmp_path: Path, capsys: Capture) -> None:
+    daemon, limits = FakeDaemon(frozen=True), ApiLimits(command_timeout_s=0.3)
+    async with serving(tmp_path, daemon, limits=limits) as (_, path):
+        assert await cli(path, "jog", "rotate", "+5deg") == 1
+        assert "the control tick did not answer" in capsys.readouterr().err

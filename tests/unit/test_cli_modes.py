@@ -1,0 +1,166 @@
+"""The mode commands and status against a daemon on a real socket: what they print, and how they exit."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from graderd.cli.app import run_app
+from graderd.core.machine import Mode, Unmet
+from tests.unit.api_daemon import FakeDaemon, serving
+
+Capture = pytest.CaptureFixture[str]
+
+
+async def cli(path: Path, *arguments: str) -> int:
+    """Run the command line in a thread: the daemon it talks to lives in this event loop."""
+    return await asyncio.to_thread(run_app, ["--socket", str(path), *arguments])
+
+
+async def test_from_disarmed_to_auto_and_stopped(tmp_path: Path, capsys: Capture) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        assert await cli(path, "arm") == 0
+        assert "armed: manual" in capsys.readouterr().out
+        assert await cli(path, "auto") == 0
+        assert daemon.state.mode is Mode.AUTO
+        assert await cli(path, "stop", "--reason", "enough") == 0
+        assert daemon.status().mode is Mode.STOPPED
+        assert "enough" in daemon.status().reason
+        assert await cli(path, "stop") == 0
+        capsys.readouterr()
+        assert await cli(path, "arm") == 1
+        said = capsys.readouterr()
+        assert said.err.startswith("graderd: arm: stopped: enough")
+        assert said.err.endswith("reset first, then arm\n")
+        assert said.err.count("\n") == 1
+        assert await cli(path, "reset") == 0
+        assert daemon.status().mode is Mode.DISARMED
+        assert await cli(path, "manual") == 1
+        assert await cli(path, "disarm") == 0
+
+
+async def test_arm_lists_what_is_unmet(tmp_path: Path, capsys: Capture) -> None:
+    daemon = FakeDaemon(unmet=(Unmet("camera fresh", "no picture yet", "look at the camera's cable"),))
+    async with serving(tmp_path, daemon) as (_, path):
+        assert await cli(path, "arm") == 1
+        said = capsys.readouterr()
+        assert "UNMET" in said.out
+        assert "camera fresh" in said.out
+        assert "look at the camera's cable" in said.err
+        assert await cli(path, "arm", "--json") == 1
+        problem = json.loads(capsys.readouterr().out)
+        assert problem == {
+            "error": "not ready: camera fresh: no picture yet",
+            "where": "arm",
+            "remedy": "look at the camera's cable",
+        }
+
+
+@pytest.mark.parametrize("command", ["arm", "disarm", "stop", "reset", "status"])
+async def test_json_is_one_object(tmp_path: Path, capsys: Capture, command: str) -> None:
+    async with serving(tmp_path) as (_, path):
+        assert await cli(path, command, "--json") == 0
+        out = capsys.readouterr().out
+        assert out.count("\n") == 1
+        assert isinstance(json.loads(out), dict)
+
+
+async def test_status_for_people_shows_what_matters(tmp_path: Path, capsys: Capture) -> None:
+    daemon = FakeDaemon(unmet=(Unmet("camera fresh", "no picture yet", "look at the camera's cable"),))
+    async with serving(tmp_path, daemon) as (_, path):
+        assert await cli(path, "status") == 0
+        out = capsys.readouterr().out
+        for text in ("disarmed: started disarmed", "rotation", "lift_left", "0.0 deg", "camera fresh", "no picture"):
+            assert text in out
+        assert "\x1b" not in out
+
+
+async def test_watch_prints_one_object_a_line(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (_, path):
+        process = await asyncio.create_subprocess_exec(
+            *command_line(path, "status", "--watch", "--json"), stdout=asyncio.subprocess.PIPE
+        )
+        assert process.stdout is not None
+        times = [json.loads(await asyncio.wait_for(process.stdout.readline(), 20))["time_s"] for _ in range(3)]
+        assert times == sorted(set(times))
+        process.terminate()
+        await process.wait()
+
+
+def command_line(path: Path, *arguments: str) -> list[str]:
+    import sys
+
+    return [sys.executable, "-m", "graderd.cli", "--socket", str(path), *arguments]
+
+
+@pytest.mark.parametrize("command", ["status", "arm", "stop", "auto", "preset"])
+def test_no_daemon_is_exit_status_3(tmp_path: Path, capsys: Capture, command: str) -> None:
+    path = tmp_path / "none.sock"
+    assert run_app(["--socket", str(path), command]) == 3
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith(f"graderd: {path}: no daemon serves this socket. start it with")
+    assert said.err.count("\n") == 1
+    if command == "stop":
+        assert "emergency stop" in said.err
+
+
+def test_the_socket_is_found_by_the_environment(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GRADERD_SOCKET", str(tmp_path / "named.sock"))
+    assert run_app(["status"]) == 3
+    assert "named.sock" in capsys.readouterr().err
+    monkeypatch.delenv("GRADERD_SOCKET")
+    monkeypatch.setattr("graderd.cli.client.SYSTEM_SOCKET", tmp_path / "system.sock")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "user"))
+    assert run_app(["status"]) == 3
+    assert str(tmp_path / "user" / "graderd" / "graderd.sock") in capsys.readouterr().err
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    assert run_app(["status"]) == 3
+    assert "system.sock" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["fly"], "fly"),
+        (["status", "--nonsense"], "--nonsense"),
+        (["jog", "wheel", "1deg"], "wheel"),
+        (["jog", "rotate"], "Missing argument 'value'"),
+        (["jog", "rotate", "5mm"], "its unit is deg, not mm"),
+        ([], ""),
+    ],
+)
+def test_bad_usage_is_exit_status_2(capsys: Capture, arguments: list[str], says: str) -> None:
+    assert run_app(arguments) == 2
+    said = capsys.readouterr()
+    if arguments:
+        assert said.err.count("\n") == 1
+        assert said.err.startswith("graderd: ")
+        assert says in said.err
+
+
+def test_what_is_not_the_daemon_is_told(tmp_path: Path, capsys: Capture) -> None:
+    import socket
+    import threading
+
+    def serve_nonsense(listener: socket.socket) -> None:
+        connection, _ = listener.accept()
+        with connection:
+            connection.recv(4096)
+            connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\n\r\nhello")
+
+    path = tmp_path / "other.sock"
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        thread: Any = threading.Thread(target=serve_nonsense, args=(listener,))
+        thread.start()
+        assert run_app(["--socket", str(path), "status"]) == 3
+        thread.join(5)
+    assert "what answers is not graderd" in capsys.readouterr().err
