@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,8 @@ from graderd.hal.settings import CameraSettings
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".mjpg", ".mjpeg"})
+
+Load = Callable[[], ColorImage]
 
 
 def read_picture(path: Path) -> ColorImage:
@@ -28,7 +31,10 @@ def read_picture(path: Path) -> ColorImage:
         data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
     except OSError as error:
         raise DeviceMissingError(str(path), f"cannot be read ({error.strerror or error})") from error
-    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    try:
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    except cv2.error as error:
+        raise ProtocolError(str(path), f"not a readable picture ({error.err})") from error
     if picture is None:
         raise ProtocolError(str(path), "not a readable picture", "JPEG, PNG, BMP, TIFF and WebP are read")
     return np.asarray(picture, dtype=np.uint8)
@@ -46,7 +52,7 @@ class _Paced:
         self._path = Path(settings.path)
         self._repeat = settings.repeat
         self._period_s = 1.0 / settings.rate_hz if real_time else 0.0
-        self._frames: Iterator[tuple[str, ColorImage]] | None = None
+        self._frames: Iterator[tuple[str, Load]] | None = None
         self._due_s = 0.0
         self._number = 0
 
@@ -68,7 +74,7 @@ class _Paced:
     def _check(self) -> None:
         raise NotImplementedError
 
-    def _every(self) -> Iterator[tuple[str, ColorImage]]:
+    def _every(self) -> Iterator[tuple[str, Load]]:
         raise NotImplementedError
 
     def read(self, timeout_s: float) -> Frame:  # noqa: ARG002  (the contract's; a file is always there)
@@ -76,15 +82,16 @@ class _Paced:
 
         Raises:
             EndOfFrames: there is no further one.
-            ProtocolError: a picture is damaged.
+            ProtocolError: a picture is damaged; the next call goes on with the one after it.
             LifecycleError: not open.
         """
         if self._frames is None:
             raise LifecycleError(str(self._path), "the source is not open")
         try:
-            name, picture = next(self._frames)
+            name, load = next(self._frames)
         except StopIteration:
             raise EndOfFrames(str(self._path)) from None
+        picture = load()
         wait_s = self._due_s - time.monotonic()
         if wait_s > 0:
             time.sleep(wait_s)
@@ -116,11 +123,11 @@ class FolderCamera(_Paced):
             kinds = ", ".join(sorted(PICTURE_SUFFIXES))
             raise DeviceMissingError(str(self._path), "the folder holds no pictures", f"Looked for {kinds}")
 
-    def _every(self) -> Iterator[tuple[str, ColorImage]]:
+    def _every(self) -> Iterator[tuple[str, Load]]:
         while True:
             paths = [self._path] if self._path.is_file() else pictures_in(self._path)
             for path in paths:
-                yield path.name, read_picture(path)
+                yield path.name, partial(read_picture, path)
             if not self._repeat or not paths:
                 return
 
@@ -137,7 +144,7 @@ class VideoCamera(_Paced):
         if not readable:
             raise DeviceMissingError(str(self._path), "not a readable video", "MP4, AVI, MKV and WebM are read")
 
-    def _every(self) -> Iterator[tuple[str, ColorImage]]:
+    def _every(self) -> Iterator[tuple[str, Load]]:
         while True:
             video = cv2.VideoCapture(str(self._path))
             try:
@@ -147,7 +154,7 @@ class VideoCamera(_Paced):
                     if not got:
                         break
                     number += 1
-                    yield f"{self._path.stem}#{number}", np.asarray(picture, dtype=np.uint8)
+                    yield f"{self._path.stem}#{number}", partial(np.asarray, picture, np.uint8)
             finally:
                 video.release()
             if not self._repeat:

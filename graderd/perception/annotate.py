@@ -10,7 +10,7 @@ import numpy as np
 from graderd.core.blade import BladeGeometry
 from graderd.core.zones import SoilObservation, Zone
 from graderd.perception.geometry import CENTER, F64, LEFT, RIGHT, U8, View, third_outlines_px, top_edge_m
-from graderd.perception.settings import CameraCalibration
+from graderd.perception.settings import Mounting
 
 Bgr = tuple[int, int, int]
 COLORS: dict[int, Bgr] = {LEFT: (80, 200, 80), CENTER: (230, 170, 60), RIGHT: (60, 120, 240)}
@@ -21,9 +21,9 @@ WHITE: Bgr = (255, 255, 255)
 DARK: Bgr = (30, 30, 30)
 
 
-def image_right_is_left(calibration: CameraCalibration | None) -> bool:
+def image_right_is_left(mounting: Mounting) -> bool:
     """Whether the picture's right is the operator's left: so for every camera that faces the blade from the front."""
-    return calibration is None or calibration.mounting == "facing_blade_from_front"
+    return mounting == "facing_blade_from_front"
 
 
 def annotate(

@@ -19,7 +19,7 @@ from graderd.perception.depth import DepthJudge, HeightMap
 from graderd.perception.fused import fuse
 from graderd.perception.geometry import CENTER, LEFT, RIGHT, U8, Region, View, blade_region, image_thirds
 from graderd.perception.health import HealthMonitor
-from graderd.perception.settings import CameraCalibration, PerceptionSettings
+from graderd.perception.settings import CameraCalibration, Mounting, PerceptionSettings
 
 ANGLE_STEP_DEG = 0.25
 KEPT_REGIONS_N = 64
@@ -57,9 +57,11 @@ class SoilClassifier:
         calibration: CameraCalibration | None,
         blade: BladeGeometry,
         live: bool = True,
+        mounting: Mounting = "facing_blade_from_front",
     ) -> None:
         self._settings = settings
         self._calibration = calibration
+        self._mounting = calibration.mounting if calibration is not None else mounting
         self._blade = blade
         self._health = HealthMonitor(settings.health, live)
         self._views: dict[tuple[str, Intrinsics], View] = {}
@@ -90,7 +92,7 @@ class SoilClassifier:
         """See :class:`Classifier`."""
         view = self.color_view(frame)
         return drawing.annotate(
-            frame.color_bgr, observation, view, self._blade, drawing.image_right_is_left(self._calibration)
+            frame.color_bgr, observation, view, self._blade, drawing.image_right_is_left(self._mounting)
         )
 
     def color_view(self, frame: Frame) -> View | None:
@@ -137,13 +139,12 @@ class SoilClassifier:
         halvings = 2 if width >= 1000 else 1 if width >= 500 else 0
         regions: _Regions | None = None
         if view is None:
-            left = drawing.image_right_is_left(self._calibration)
-            regions = _Regions(image_thirds(width, height, 0, left), image_thirds(width, height, halvings, left))
+            mirrored = drawing.image_right_is_left(self._mounting)
+            full, fast = (image_thirds(width, height, n, mirrored) for n in (0, halvings))
         else:
-            full = blade_region(view, self._blade, step * ANGLE_STEP_DEG, 0)
-            fast = blade_region(view, self._blade, step * ANGLE_STEP_DEG, halvings)
-            if full is not None and fast is not None:
-                regions = _Regions(full, fast)
+            full, fast = (blade_region(view, self._blade, step * ANGLE_STEP_DEG, n) for n in (0, halvings))
+        if full is not None and fast is not None:
+            regions = _Regions(full, fast)
         self._regions[key] = regions
         if len(self._regions) > KEPT_REGIONS_N:
             self._regions.popitem(last=False)
@@ -161,7 +162,9 @@ class SoilClassifier:
         settings = self._settings
         regions = self._region(frame, angle_deg)
         if regions is None:
-            return Verdict(Zone.UNKNOWN, 0.0, "the blade is not in the picture at this angle"), []
+            return Verdict(
+                Zone.UNKNOWN, 0.0, "the blade is not in the picture at this angle, or the picture is too small"
+            ), []
         faults = self._health.blurred(frame.color_bgr, regions.full)
         if faults:
             return Verdict(Zone.UNKNOWN, 0.0, ""), faults
@@ -186,7 +189,7 @@ class SoilClassifier:
     def _said(self, frame: Frame, verdict: Verdict) -> Verdict:
         if self.color_view(frame) is not None:
             return verdict
-        side = "right" if drawing.image_right_is_left(self._calibration) else "left"
+        side = "right" if drawing.image_right_is_left(self._mounting) else "left"
         note = f"thirds of the whole picture, its {side} taken as the operator's left (no calibration applies)"
         return Verdict(
             verdict.zone, 0.5 * verdict.confidence, f"{verdict.reason}; {note}", verdict.shares, verdict.volumes_l
@@ -223,11 +226,15 @@ class SoilClassifier:
 
 
 def make_classifier(
-    settings: PerceptionSettings, calibration: CameraCalibration | None, blade: BladeGeometry, live: bool = True
+    settings: PerceptionSettings,
+    calibration: CameraCalibration | None,
+    blade: BladeGeometry,
+    live: bool = True,
+    mounting: Mounting = "facing_blade_from_front",
 ) -> Classifier:
     """A classifier for one stream of frames.
 
-    ``calibration`` None: thirds of the whole picture (colour methods only). ``live`` False: the frames are stills, so
-    equal pictures and changing sizes are no fault.
+    ``calibration`` None: thirds of the whole picture (colour methods only), left and right after ``mounting``.
+    ``live`` False: the frames are stills, so equal pictures and changing sizes are no fault.
     """
-    return SoilClassifier(settings, calibration, blade, live)
+    return SoilClassifier(settings, calibration, blade, live, mounting)

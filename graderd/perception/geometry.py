@@ -140,15 +140,13 @@ def blade_region(view: View, blade: BladeGeometry, angle_deg: float, halvings: i
     return region_of(third_outlines_px(view, blade, angle_deg), view.lens.width, view.lens.height, halvings)
 
 
-def image_thirds(width_px: int, height_px: int, halvings: int, image_right_is_left: bool) -> Region:
-    """The whole picture in three upright strips: what is left to do where no geometry is known."""
+def image_thirds(width_px: int, height_px: int, halvings: int, image_right_is_left: bool) -> Region | None:
+    """The whole picture in three upright strips, where no geometry is known; None for a picture too small."""
     border = [0.0, width_px / 3, 2 * width_px / 3, float(width_px)]
     strips = [np.array([[a, 0.0], [b, 0.0], [b, height_px], [a, height_px]]) for a, b in pairwise(border)]
     if not image_right_is_left:
         strips.reverse()
-    region = region_of((strips[0], strips[1], strips[2]), width_px, height_px, halvings)
-    assert region is not None  # the outlines fill the picture
-    return region
+    return region_of((strips[0], strips[1], strips[2]), width_px, height_px, halvings)
 
 
 def region_of(outlines_px: tuple[F64, F64, F64], width_px: int, height_px: int, halvings: int) -> Region | None:

@@ -109,6 +109,7 @@ class DecisionSettings(Settings):
     )
     even_share_min_percent: Percent = Field(default=20.0, description="even: no third holds less of the soil than this")
     even_share_max_percent: Percent = Field(default=48.0, description="even: no third holds more of the soil than this")
+    max_frame_age_s: Positive = Field(default=0.1, description="a frame older than this is not judged: unknown")
     max_angle_age_s: Positive = Field(default=0.25, description="a blade angle older than this at capture: unknown")
 
 
