@@ -1,0 +1,425 @@
+"""One Electrak as a linear axis: the driver behind :class:`graderd.hal.linear_actuator.LinearActuator`."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import math
+from typing import Final
+
+from drivers.electrak.codec import Control, ElectrakCodec, Feedback
+from drivers.electrak.link import CanLink
+from drivers.electrak.monitor import DISARMING, FAILING, INFORMATIVE, LATCHING, FaultMemory, FeedbackMonitor
+from drivers.electrak.planner import Motion, MotionPlanner
+from drivers.electrak.profile import load_profile
+from drivers.electrak.thermal import ThermalGuard
+from graderd.hal.clock import Clock, SystemClock
+from graderd.hal.errors import (
+    CommandRangeError,
+    DeviceError,
+    DeviceRefusedError,
+    DeviceTimeoutError,
+    LifecycleError,
+)
+from graderd.hal.fault import DeviceFault
+from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.linear_actuator import ActuatorTelemetry
+from graderd.hal.reading import Reading
+from graderd.hal.settings import ActuatorSettings
+
+WAKE_TIMEOUT_S: Final = 3.0
+_RECOVERY_N: Final = 3
+"""Feedback messages in a row after which a lost actuator is back."""
+_TRUST_N: Final = 10
+"""Plausible messages in a row after which feedback is believed again."""
+_CLOSE_REPEATS_N: Final = 3
+_RETRY_PAUSE_S: Final = 1.0
+_VELOCITY_N: Final = 3
+
+
+class ElectrakActuator:
+    """A Thomson Electrak HD or MD (option CNO) on a shared :class:`CanLink`.
+
+    ``name`` is ``lift_left``, ``lift_right`` or ``tilt``. See the contract for the calls; what is special here:
+
+    * the control message goes out every 100 ms in every state but closed, with motion disabled unless a fresh target
+      exists, which keeps the actuator awake and its feedback coming;
+    * after an overload, motion stays disabled until the actuator's flag is gone, then the settings' number of retries
+      follows, one a second; when they are used up the fault latches and the axis is in standby;
+    * a latched fault (see ``monitor.LATCHING``) goes with the next successful :meth:`arm`.
+    """
+
+    def __init__(self, name: str, settings: ActuatorSettings, link: CanLink, clock: Clock | None = None) -> None:
+        self.name = name
+        self.settings = settings
+        self.profile = load_profile(settings.profile)
+        figures = self.profile.figures
+        self._check_settings()
+        self._link = link
+        self._clock = clock or SystemClock()
+        self._codec = ElectrakCodec(self.profile.layout)
+        self._planner = MotionPlanner(
+            figures, current_limit_a=settings.current_limit_a, speed_percent=settings.speed_percent
+        )
+        self._faults = FaultMemory(name)
+        self._monitor = FeedbackMonitor(figures, settings.address_n, self._faults)
+        self._thermal = ThermalGuard(figures)
+        self._lifecycle = Lifecycle.CLOSED
+        self._opened_at_s = 0.0
+        self._feedback: Feedback | None = None
+        self._feedback_at_s = -math.inf
+        self._track: collections.deque[tuple[float, float]] = collections.deque(maxlen=_VELOCITY_N)
+        self._velocity_mm_per_s = 0.0
+        self._heard = asyncio.Event()
+        self._good_n = 0
+        self._target_at_s = 0.0
+        self._sent: Reading[float] | None = None
+        self._sent_enabled = False
+        self._retries_left_n = settings.overload_retries_n
+        self._overload_at_s: float | None = None
+        self._overload_seen = False
+        self._claimed_name: int | None = None
+        self._counters = {"feedback_n": 0, "control_n": 0, "overloads_n": 0, "restarts_n": 0, "target_timeouts_n": 0}
+
+    # -- what is known ----------------------------------------------------------------------------------------------
+
+    @property
+    def address(self) -> int:
+        """J1939 address of the actuator."""
+        return self.settings.address_n
+
+    @property
+    def lifecycle(self) -> Lifecycle:
+        """Present lifecycle state."""
+        self._watch(self._clock.now_s())
+        return self._lifecycle
+
+    @property
+    def j1939_name(self) -> int | None:
+        """The 64-bit NAME it claimed its address with, if a claim was heard."""
+        return self._claimed_name
+
+    def telemetry(self) -> ActuatorTelemetry:
+        """Newest readings, each with its time."""
+        feedback, at_s = self._feedback, self._feedback_at_s
+        counters = {**self._counters, "bad_feedback_n": self._monitor.bad_n}
+        if feedback is None:
+            return ActuatorTelemetry(thermal_load=self._thermal.load, target_sent_mm=self._sent, counters=counters)
+        return ActuatorTelemetry(
+            position_mm=Reading(feedback.position_mm, at_s),
+            velocity_mm_per_s=Reading(self._velocity_mm_per_s, at_s),
+            current_a=Reading(feedback.current_a, at_s),
+            duty_percent=Reading(feedback.duty_percent, at_s),
+            moving=Reading(feedback.moving, at_s),
+            flags=Reading(feedback.flags, at_s),
+            target_sent_mm=self._sent,
+            thermal_load=self._thermal.load,
+            counters=counters,
+        )
+
+    def faults(self) -> tuple[DeviceFault, ...]:
+        """Conditions present now; latched ones until the next arm."""
+        self._watch(self._clock.now_s())
+        return self._faults.all()
+
+    # -- life -------------------------------------------------------------------------------------------------------
+
+    async def open(self) -> None:
+        """closed -> standby: wake the device with motion disabled and wait for its first feedback.
+
+        Raises:
+            LifecycleError: it is open already.
+            DeviceMissingError: the channel does not exist.
+            DeviceTimeoutError: no feedback within three seconds.
+        """
+        if self._lifecycle is not Lifecycle.CLOSED:
+            raise LifecycleError(self.name, f"cannot open while {self._lifecycle}", "Close it first")
+        await self._link.open()
+        now_s = self._clock.now_s()
+        self._forget(now_s)
+        self._opened_at_s = now_s
+        self._link.attach(self)
+        try:
+            async with asyncio.timeout(WAKE_TIMEOUT_S):
+                await self._heard.wait()
+        except TimeoutError:
+            self._link.detach(self)
+            self._faults.clear(*self._faults.names())
+            raise self._no_feedback_error() from None
+        except BaseException:
+            self._link.detach(self)
+            raise
+        self._lifecycle = Lifecycle.STANDBY
+
+    async def arm(self) -> None:
+        """standby -> active: motion may be enabled from now on; nothing moves until a target is set.
+
+        Raises:
+            LifecycleError: not in standby.
+            DeviceRefusedError: a fault is present.
+            DeviceTimeoutError: feedback is stale.
+        """
+        now_s = self._clock.now_s()
+        self._watch(now_s)
+        if self._lifecycle is not Lifecycle.STANDBY:
+            raise LifecycleError(self.name, f"cannot arm while {self._lifecycle}", self._remedy())
+        if self._link.address is None:
+            raise DeviceRefusedError(self.name, "graderd has no J1939 address yet", "Wait, or look at the can faults")
+        if now_s - self._feedback_at_s > self.settings.feedback_timeout_s:
+            raise DeviceTimeoutError(self.name, f"feedback is {now_s - self._feedback_at_s:.2f} s old")
+        feedback = self._feedback
+        flags = feedback.flags if feedback else frozenset()
+        standing = [flag for flag in ("overload", "fatal") if flag in flags]
+        self._faults.clear(*(LATCHING - set(standing)))
+        left = self._faults.names() - INFORMATIVE
+        if left:
+            details = "; ".join(f.detail for f in self._faults.all() if f.condition in left)
+            raise DeviceRefusedError(self.name, f"cannot arm with {', '.join(sorted(left))}: {details}")
+        self._planner.hold()
+        self._monitor.reset(now_s)
+        self._retries_left_n = self.settings.overload_retries_n
+        self._overload_at_s = None
+        self._lifecycle = Lifecycle.ACTIVE
+
+    async def disarm(self) -> None:
+        """active -> standby: motion disabled at once, keep-alive and feedback go on."""
+        self.hold()
+        if self._lifecycle is Lifecycle.ACTIVE:
+            self._lifecycle = Lifecycle.STANDBY
+
+    async def close(self) -> None:
+        """Any state -> closed: motion disabled several times, then silent."""
+        if self._lifecycle is Lifecycle.CLOSED:
+            return
+        self._planner.hold()
+        self._lifecycle = Lifecycle.STANDBY
+        for repeat in range(_CLOSE_REPEATS_N):
+            if repeat:
+                await asyncio.sleep(0.01)
+            self._link.send_control(self)
+        self._link.detach(self)
+        self._lifecycle = Lifecycle.CLOSED
+        self._faults.clear(*self._faults.names())
+
+    # -- commands ---------------------------------------------------------------------------------------------------
+
+    def set_target_mm(self, target_mm: float, speed_share: float = 1.0) -> None:
+        """Take a new target; see the contract.
+
+        Raises:
+            LifecycleError: not active.
+            CommandRangeError: not finite or outside the soft limits; the former target stays.
+        """
+        now_s = self._clock.now_s()
+        self._watch(now_s)
+        if self._lifecycle is not Lifecycle.ACTIVE:
+            raise LifecycleError(self.name, f"no target while {self._lifecycle}", self._remedy())
+        low, high = self.settings.min_mm, self.settings.max_mm
+        if not (math.isfinite(target_mm) and low <= target_mm <= high):
+            raise CommandRangeError(self.name, f"target {target_mm} mm is outside {low} to {high} mm")
+        if not (math.isfinite(speed_share) and 0.0 < speed_share <= 1.0):
+            raise CommandRangeError(self.name, f"speed share {speed_share} is not above 0 and at most 1")
+        self._target_at_s = now_s
+        self._planner.set_target(target_mm, speed_share)
+
+    def hold(self) -> None:
+        """Motion disabled with the next control message, sent at once. Allowed in every state, idempotent."""
+        self._planner.hold()
+        if self._sent_enabled:
+            self._link.send_control(self)
+
+    # -- the link's side --------------------------------------------------------------------------------------------
+
+    def control_data(self, now_s: float) -> bytes:
+        """The control message that goes out now."""
+        self._watch(now_s)
+        control = self._next_control(now_s)
+        self._sent_enabled = control.motion_enable
+        if control.motion_enable:
+            self._sent = Reading(control.target_mm, now_s)
+        self._counters["control_n"] += 1
+        self._monitor.on_sent(control.motion_enable, self._planner.direction, now_s)
+        return self._codec.encode_control(control)
+
+    def on_feedback(self, data: bytes, now_s: float) -> None:
+        """A feedback message from this address."""
+        try:
+            feedback = self._codec.decode_feedback(data)
+        except ValueError as error:
+            self._good_n = 0
+            self._monitor.on_garbage(str(error), now_s)
+            self._watch(now_s)
+            return
+        if now_s - self._feedback_at_s > self.settings.feedback_timeout_s:
+            self._good_n = 0
+            self._track.clear()
+            self._monitor.reset(now_s)
+        sent = self._sent
+        remaining_mm = abs(sent.value - feedback.position_mm) if sent and self._sent_enabled else 0.0
+        if not self._monitor.on_feedback(feedback, self._planner.direction, remaining_mm, now_s):
+            self._good_n = 0
+            self._watch(now_s)
+            return
+        self._counters["feedback_n"] += 1
+        self._feedback, self._feedback_at_s = feedback, now_s
+        self._velocity(feedback, now_s)
+        self._thermal.update(feedback.current_a, now_s)
+        self._planner.on_feedback(self._motion(now_s))
+        self._good_n += 1
+        self._heard.set()
+        if self._good_n >= _RECOVERY_N:
+            self._faults.clear("no_feedback", "wrong_address")
+        if self._good_n >= _TRUST_N:
+            self._faults.clear("implausible_feedback")
+        self._overload(feedback, now_s)
+        self._watch(now_s)
+
+    def on_claim(self, name: int, solicited: bool, now_s: float) -> None:
+        """An address claim from this address: an unasked one of a unit that was awake means that it restarted."""
+        awake = now_s - self._feedback_at_s < 2.0
+        moved_in = self._claimed_name is not None and name != self._claimed_name
+        self._claimed_name = name
+        if self._lifecycle is Lifecycle.CLOSED or (solicited and not moved_in) or not awake:
+            return
+        self._counters["restarts_n"] += 1
+        what = "another unit claimed its address" if moved_in else "it claimed its address anew: a power cut?"
+        self._faults.set("restarted", what, now_s)
+        self._watch(now_s)
+
+    def on_link_lost(self, now_s: float) -> None:
+        """The bus is gone."""
+        self._good_n = 0
+        self._sent_enabled = False
+        self._faults.set("no_feedback", f"{self._link.where} is lost", now_s)
+        self._fail()
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _next_control(self, now_s: float) -> Control:
+        feedback = self._feedback
+        here_mm = feedback.position_mm if feedback else 0.0
+        if self._lifecycle is not Lifecycle.ACTIVE or feedback is None:
+            return self._planner.disabled(here_mm)
+        if self._planner.target_mm is not None and now_s - self._target_at_s > self.settings.target_timeout_s:
+            self._counters["target_timeouts_n"] += 1
+            self._planner.hold()
+        waiting = self._overload_at_s is not None
+        may_move = self._thermal.may_move(now_s) and not waiting
+        return self._planner.control(self._motion(now_s), may_move=may_move)
+
+    def _motion(self, now_s: float) -> Motion:
+        feedback = self._feedback
+        if feedback is None:
+            return Motion(0.0, 0.0, moving=False, age_s=0.0)
+        age_s = max(0.0, now_s - self._feedback_at_s)
+        return Motion(feedback.position_mm, self._velocity_mm_per_s, feedback.moving, age_s)
+
+    def _velocity(self, feedback: Feedback, now_s: float) -> None:
+        self._track.append((now_s, feedback.position_mm))
+        if not feedback.moving and feedback.duty_percent == 0:
+            self._velocity_mm_per_s = 0.0
+            return
+        first_s, first_mm = self._track[0]
+        if now_s - first_s > 0.5 * self.profile.figures.afm_period_s:
+            fastest = 1.1 * self.profile.figures.speed_no_load_mm_per_s
+            velocity = (feedback.position_mm - first_mm) / (now_s - first_s)
+            self._velocity_mm_per_s = min(max(velocity, -fastest), fastest)
+
+    def _overload(self, feedback: Feedback, now_s: float) -> None:
+        """The latch in the actuator is reset by the disabled messages; ours by retries or by arming."""
+        is_set = "overload" in feedback.flags
+        if is_set and not self._overload_seen:
+            self._counters["overloads_n"] += 1
+            if self._lifecycle is Lifecycle.ACTIVE and self._retries_left_n > 0:
+                self._retries_left_n -= 1
+                self._overload_at_s = now_s
+                if self._sent_enabled:
+                    self._link.send_control(self)
+            else:
+                limit_a = self.settings.current_limit_a
+                tried_n = self.settings.overload_retries_n
+                detail = f"more than {limit_a:.1f} A for 50 ms" + (f", {tried_n} retries used up" if tried_n else "")
+                self._faults.set("overload", detail, now_s)
+        self._overload_seen = is_set
+        paused_s = 0.0 if self._overload_at_s is None else now_s - self._overload_at_s
+        if not is_set and paused_s > _RETRY_PAUSE_S:
+            self._overload_at_s = None
+
+    def _watch(self, now_s: float) -> None:
+        """Draw the consequences: lost feedback fails the axis, disarming faults take it out of the active state."""
+        if self._lifecycle is Lifecycle.CLOSED:
+            return
+        age_s = now_s - max(self._feedback_at_s, self._opened_at_s)
+        if age_s > self.settings.feedback_timeout_s:
+            self._good_n = 0
+            strangers = [a for a in self._link.feedback_strangers(now_s) if 19 <= a <= 42]
+            detail = f"no feedback from address {self.address} for {age_s:.2f} s"
+            if strangers and self._link.is_open:
+                heard = ", ".join(str(a) for a in strangers)
+                self._faults.set("wrong_address", f"{detail}, but an actuator at address {heard} is heard", now_s)
+            else:
+                self._faults.set("no_feedback", detail, now_s)
+        names = self._faults.names()
+        if names & FAILING:
+            self._fail()
+        elif self._lifecycle is Lifecycle.FAILED:
+            self._lifecycle = Lifecycle.STANDBY
+        if self._lifecycle is Lifecycle.ACTIVE and names & DISARMING:
+            self._lifecycle = Lifecycle.STANDBY
+            self.hold()
+        thermal = self._thermal
+        load = f"{100 * thermal.load:.0f} % of the heat budget"
+        self._faults.keep("thermal_limit", thermal.limited, f"{load}: no motion until it is cooler", now_s)
+        self._faults.keep("thermal_derating", thermal.derating and not thermal.limited, f"{load}: rests added", now_s)
+
+    def _fail(self) -> None:
+        if self._lifecycle is not Lifecycle.CLOSED and self._lifecycle is not Lifecycle.FAILED:
+            self._lifecycle = Lifecycle.FAILED
+            self.hold()
+
+    def _forget(self, now_s: float) -> None:
+        self._planner.hold()
+        self._monitor.reset(now_s)
+        self._faults.clear(*self._faults.names())
+        self._feedback, self._feedback_at_s = None, -math.inf
+        self._velocity_mm_per_s = 0.0
+        self._track.clear()
+        self._heard.clear()
+        self._good_n = 0
+        self._sent, self._sent_enabled = None, False
+        self._overload_at_s, self._overload_seen = None, False
+        self._claimed_name = None
+
+    def _check_settings(self) -> None:
+        figures, settings = self.profile.figures, self.settings
+        wrong = []
+        if settings.max_mm > figures.stroke_mm:
+            wrong.append(f"max_mm {settings.max_mm} is beyond the stroke of {figures.stroke_mm} mm")
+        if settings.current_limit_a > figures.current_limit_max_a:
+            wrong.append(f"current_limit_a {settings.current_limit_a} is above {figures.current_limit_max_a} A")
+        if settings.feedback_timeout_s <= 2 * figures.afm_period_s:
+            wrong.append(f"feedback_timeout_s {settings.feedback_timeout_s} is not even two feedback periods")
+        if wrong:
+            raise CommandRangeError(f"settings of {self.name}", "; ".join(wrong), f"Profile: {self.profile.name}")
+
+    def _remedy(self) -> str:
+        match self._lifecycle:
+            case Lifecycle.CLOSED:
+                return "Open it first"
+            case Lifecycle.STANDBY:
+                return "Arm it first"
+            case Lifecycle.ACTIVE:
+                return "It is active already"
+        return "; ".join(fault.detail for fault in self._faults.all()) or "Wait until its feedback is back"
+
+    def _no_feedback_error(self) -> DeviceError:
+        now_s = self._clock.now_s()
+        strangers = self._link.feedback_strangers(now_s)
+        remedy = "Check its supply, the 120 ohm terminators and address_n"
+        if strangers:
+            remedy = f"Actuators are heard at address {', '.join(map(str, strangers))}: check address_n and select pins"
+        if self._link.address is None:
+            remedy = "graderd got no J1939 address: look at the can faults"
+        return DeviceTimeoutError(
+            self.name, f"no feedback from address {self.address} within {WAKE_TIMEOUT_S:.0f} s", remedy
+        )
