@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import resource
 import shlex
 import shutil
 import signal
@@ -144,6 +145,8 @@ def _guest_process(command: Sequence[str], output_fd: int, scratch: str) -> Iter
     """The kernel in a process group of its own, all of which is gone afterwards whatever happens."""
     # The kernel keeps its memory and its sockets in these; the scratch directory takes them away again.
     environment = {**os.environ, "TMPDIR": "/dev/shm" if os.access("/dev/shm", os.W_OK) else scratch, "HOME": scratch}
+    # The kernel keeps a descriptor for each file of the host the guest has looked at.
+    resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
     process = subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=output_fd, stderr=output_fd, env=environment, start_new_session=True
     )

@@ -34,6 +34,9 @@ PYTHONS = ("3.11", "3.12", "3.13")
 EXTRAS = ("camera",)
 PREFIX = Path("opt/graderd")
 
+# Folders of dependencies that serve only their own development.
+NOT_SHIPPED = {"tests", "_pyinstaller", "__pyinstaller", "include"}
+
 # Where our own files go: source in the project, place in the package, mode.
 FILES = (
     ("systemd/graderd.service", "usr/lib/systemd/system/graderd.service", 0o644),
@@ -149,7 +152,8 @@ def unpack(wheel: Path, folder: Path) -> None:
                 if kind not in ("purelib", "platlib") or not rest:
                     continue
                 member.filename = rest
-            archive.extract(member, folder)
+            if not NOT_SHIPPED.intersection(Path(member.filename).parts[1:-1]):
+                archive.extract(member, folder)
 
 
 def make_environment(package: Package, wheels: dict[str, list[Path]], own: Path) -> None:
