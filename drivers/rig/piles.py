@@ -13,7 +13,7 @@ PILE_LENGTH_M, PILE_WIDTH_M, PILE_HEIGHT_M = 1.0, 0.45, 0.3
 """A heap for scattering work (section 3.3 of the paper), along the travel, across, and up, as poured."""
 PILE_OFFSET_M = 0.42
 """Distance of a left or right heap's middle line from the bed's."""
-LAYER_HEIGHT_M = 0.08
+LAYER_HEIGHT_M = 0.06
 LAYER_HALF_WIDTH_M = 0.70
 LAYER_BEHIND_M, LAYER_AHEAD_M = 0.9, 4.5
 TOE_M = -0.08
@@ -44,7 +44,9 @@ def heap(
     return np.asarray(height_m * dome * _lumps(field, seed))
 
 
-def layer(field: SoilField, x_min_m: float, x_max_m: float, half_width_m: float, height_m: float, seed: int = 0) -> FloatArray:
+def layer(
+    field: SoilField, x_min_m: float, x_max_m: float, half_width_m: float, height_m: float, seed: int = 0
+) -> FloatArray:
     """An even layer between two places along the bed, ``half_width_m`` to either side of its middle line."""
     inside = ((field.x_m >= x_min_m) & (field.x_m <= x_max_m))[:, None] & (np.abs(field.y_m) <= half_width_m)[None, :]
     return np.asarray(inside * height_m * _lumps(field, seed, depth=0.12))
@@ -60,9 +62,7 @@ def lay_scene(field: SoilField, zone: SceneZone, x_m: float, pose: BladePose, se
     if zone is SceneZone.NONE:
         return
     if zone is SceneZone.EVEN:
-        field.add(
-            layer(field, x_m - LAYER_BEHIND_M, x_m + LAYER_AHEAD_M, LAYER_HALF_WIDTH_M, LAYER_HEIGHT_M, seed)
-        )
+        field.add(layer(field, x_m - LAYER_BEHIND_M, x_m + LAYER_AHEAD_M, LAYER_HALF_WIDTH_M, LAYER_HEIGHT_M, seed))
         return
     y_m = {SceneZone.LEFT: PILE_OFFSET_M, SceneZone.CENTER: 0.0, SceneZone.RIGHT: -PILE_OFFSET_M}[zone]
     field.add(heap(field, x_m + 1.2, y_m, PILE_LENGTH_M, PILE_WIDTH_M, PILE_HEIGHT_M, seed))

@@ -12,7 +12,16 @@ import numpy.typing as npt
 from drivers.rig.blade import EDGE_GAP_M, FACE_HEIGHT_M, LENGTH_M, BladePose
 from drivers.rig.look import Look
 from drivers.rig.optics import COLOR_INTRINSICS, COLOR_POSE, DEPTH_INTRINSICS, DEPTH_POSE
-from drivers.rig.paint import TEXEL_M, Image8, Image32, blade_paint, ground_palette, soil_grain, soil_palette, wood_grain
+from drivers.rig.paint import (
+    TEXEL_M,
+    Image8,
+    Image32,
+    blade_paint,
+    ground_palette,
+    soil_grain,
+    soil_palette,
+    wood_grain,
+)
 from drivers.rig.shapes import ARC_RAD, MACHINE, BladeHit, Solid, meet_blade, rotation
 from drivers.rig.soil import BED_LENGTH_M, BED_WIDTH_M
 from drivers.rig.stereo import StereoNoise

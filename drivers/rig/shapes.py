@@ -121,7 +121,9 @@ class Solid:
         """Own unit coordinates from the vehicle frame: the solid becomes the unit cube or the unit ball."""
         origin = scale @ (np.array(rays.position_m) - np.array(self.centre_m))
         x, y, z = rays.dx[area], rays.dy[area], rays.dz[area]
-        own = [np.asarray(np.float32(m[0]) * x + np.float32(m[1]) * y + np.float32(m[2]) * z, np.float32) for m in scale]
+        own = [
+            np.asarray(np.float32(m[0]) * x + np.float32(m[1]) * y + np.float32(m[2]) * z, np.float32) for m in scale
+        ]
         if self.kind == "ellipsoid":
             depth, normal = self._ball(origin, own)
         else:

@@ -96,9 +96,16 @@ class SoilField:
         self.heights_m[:] = 0.0
 
     def add(self, heights_m: FloatArray) -> None:
-        """Pour soil: ``heights_m`` (the field's shape, not negative) is added and settles over the whole bed."""
+        """Pour soil: ``heights_m`` (the field's shape, not negative) is added and settles where it fell."""
         self.heights_m += heights_m
-        self.settle(self.whole)
+        wet_x, wet_y = (np.flatnonzero(heights_m.any(axis=axis)) for axis in (1, 0))
+        if wet_x.size == 0:
+            return
+        margin = math.ceil(float(self.heights_m.max()) / self.repose_slope / self.cell_m) + 4
+        n_x, n_y = self.heights_m.shape
+        x0, x1 = max(int(wet_x[0]) - margin, 0), min(int(wet_x[-1]) + margin, n_x)
+        y0, y1 = max(int(wet_y[0]) - margin, 0), min(int(wet_y[-1]) + margin, n_y)
+        self.settle(Window(x0, x1, y0, y1))
 
     @property
     def whole(self) -> Window:

@@ -113,7 +113,9 @@ class SurfaceSweep:
         samples, columns = rows.shape
         met = np.zeros((self._rows + 1, columns), np.int32)
         # Samples are written nearest first, so of several in one row the farthest stays: the next to be met above it.
-        met[first_row, np.broadcast_to(self._column, first_row.shape)] = np.arange(1, samples + 1, dtype=np.int32)[:, None]
+        met[first_row, np.broadcast_to(self._column, first_row.shape)] = np.arange(1, samples + 1, dtype=np.int32)[
+            :, None
+        ]
         met = np.maximum.accumulate(met[: self._rows], axis=0)
         beyond = met >= samples
         np.minimum(met, samples - 1, out=met)
