@@ -339,6 +339,7 @@ class ServoBus:
             written_n = 0
         except OSError as e:
             error = DeviceLostError(self.port, f"writing failed ({e.strerror})", "Check the USB cable")
+            self._reply = None  # the request learns of it here and now
             self._shut(error)
             raise error from e
         if written_n != len(packet):

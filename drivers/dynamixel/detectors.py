@@ -6,6 +6,7 @@ one odd sample raises nothing.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from graderd.hal.settings import RotatorSettings
@@ -20,6 +21,8 @@ _SETTLE_S = 0.5
 """After the profile's own duration, so much more until the blade is expected to stand."""
 _VOLTAGE_HYSTERESIS_V = 0.3
 _TEMPERATURE_HYSTERESIS_C = 2.0
+_AT_REST_S = 0.3
+"""Standing for so long is rest; a turning point is not."""
 _CALM_S = 1.0
 """A motion fault stays until nothing of it was seen for so long."""
 
@@ -56,12 +59,15 @@ class MotionDetectors:
         self._opposed_allowed_s = 0.0
         self._rest_deg: float | None = None
         self._rest_since_s = 0.0
+        self._still_since_s = math.inf
         self._voltage_bad = False
         self._temperature_bad = False
         self._seen: dict[str, tuple[float, str]] = {}
 
     def look(self, s: Sample) -> dict[str, str]:
         """Conditions that hold with this sample: name to detail."""
+        if math.isinf(self._still_since_s):
+            self._still_since_s = s.time_s
         self._follow_goal(s)
         if s.goal_deg is not None:
             self._watch_stuck(s, s.goal_deg)
@@ -94,10 +100,12 @@ class MotionDetectors:
 
     def _watch_stuck(self, s: Sample, goal_deg: float) -> None:
         arrived = abs(goal_deg - s.angle_deg) <= self._settings.in_position_deg
-        if arrived or abs(s.angle_deg - self._progress_deg) > _MOVED_DEG:
+        st = self._settings
+        progress_deg = min(_MOVED_DEG, 0.3 * st.velocity_deg_per_s * st.not_moving_s)
+        if arrived or abs(s.angle_deg - self._progress_deg) > progress_deg:
             self._progress_deg, self._progress_s = s.angle_deg, s.time_s
         stuck_s = s.time_s - self._progress_s
-        if not arrived and stuck_s > self._settings.not_moving_s:
+        if not arrived and stuck_s > st.not_moving_s:
             detail = f"{goal_deg - s.angle_deg:+.1f}° to go, no movement for {stuck_s:.1f} s at {s.current_a:.1f} A"
             self._note(s, "not_moving", detail)
 
@@ -122,11 +130,13 @@ class MotionDetectors:
         still_expected = s.goal_deg is None or s.time_s - self._goal_since_s > self._move_s + _SETTLE_S
         still = abs(s.velocity_deg_per_s) <= _STILL_DEG_PER_S
         if not still_expected:
-            self._rest_deg = None
+            self._rest_deg, self._still_since_s = None, s.time_s
             return
         if self._rest_deg is None:
             # Where the blade came to rest; one that was still turning at the switch-over gets time to do so.
-            if still:
+            if not still:
+                self._still_since_s = s.time_s
+            elif s.time_s - self._still_since_s >= _AT_REST_S:
                 self._rest_deg, self._rest_since_s = s.angle_deg, s.time_s
             return
         moved_deg = s.angle_deg - self._rest_deg

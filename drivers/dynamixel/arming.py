@@ -1,0 +1,115 @@
+"""Powering the blade without a jump: everything written and read back before torque goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+
+from drivers.dynamixel.calibration import Calibration
+from drivers.dynamixel.device import WATCHDOG_STEP_S, Ph54Device
+from graderd.hal.errors import DeviceError, DeviceRefusedError
+from graderd.hal.settings import RotatorSettings
+
+HOLD_ACCELERATION_FACTOR = 10.0
+"""A hold brakes so much harder than a move: at 30 °/s and 60 °/s² the blade overruns by 0.75° and comes back."""
+_JUMP_DEG = 0.5
+_STILL_DEG_PER_S = 2.0
+
+
+def watchdog_counts(settings: RotatorSettings) -> int:
+    """Bus Watchdog register for the settings' time, never longer than asked (at least one step)."""
+    return max(1, min(127, math.floor(settings.watchdog_s / WATCHDOG_STEP_S + 1e-9)))
+
+
+def profile_counts(settings: RotatorSettings, calibration: Calibration, factor: float = 1.0) -> dict[str, int]:
+    """Profile registers of a move, its acceleration times ``factor``."""
+    return {
+        "profile_acceleration": calibration.acceleration_counts(settings.acceleration_deg_per_s2 * factor),
+        "profile_velocity": calibration.velocity_counts(settings.velocity_deg_per_s),
+    }
+
+
+async def power_up(device: Ph54Device, settings: RotatorSettings, calibration: Calibration) -> int:
+    """Write and read back limits, profile and watchdog, set goal := measured, torque on. Returns the goal in counts.
+
+    Position limits and current limit are EEPROM: written only where they differ (cells wear, and torque must be off
+    for it). A tripped watchdog is cleared with torque off, so that no stale goal comes alive.
+
+    Raises:
+        DeviceRefusedError: the blade moves or lies outside the soft limits, or something did not read back.
+        DeviceTimeoutError, DeviceLostError: the servo stopped answering. Torque was switched off again, or could not be
+            reached any more (then the watchdog, if armed, stops it).
+    """
+    try:
+        return await _power_up(device, settings, calibration)
+    except BaseException:
+        with contextlib.suppress(DeviceError):
+            await device.write("torque_enable", 0, urgent=True)
+        raise
+
+
+async def _power_up(device: Ph54Device, settings: RotatorSettings, calibration: Calibration) -> int:
+    health, alert = await device.read_block(device.health_block)
+    if alert or health["hardware_error_status"]:
+        raise DeviceRefusedError(
+            device.where,
+            f"hardware error 0x{health['hardware_error_status']:02X} is present",
+            "Find the cause, then `graderd rotation reboot`",
+        )
+    goals, _ = await device.read_block(device.goal_block)
+    limits, _ = await device.read_block(device.limit_block)
+    low, high = calibration.servo_limits()
+    wanted = {"current_limit": round(settings.current_limit_a * 1000.0)}
+    if not calibration.needs_turns:
+        wanted |= {"min_position_limit": low, "max_position_limit": high}
+    stale = {name: value for name, value in wanted.items() if limits[name] != value}
+    if health["torque_enable"] and (stale or goals["bus_watchdog"] != 0):
+        await device.torque(False)
+    if goals["bus_watchdog"] != 0:
+        await device.write("bus_watchdog", 0)
+    for name, value in stale.items():
+        await device.write(name, value)
+    if stale:
+        await device.confirm(wanted, device.limit_block)
+
+    profile = profile_counts(settings, calibration)
+    top = limits["velocity_limit"], limits["acceleration_limit"]
+    if profile["profile_velocity"] > top[0] or profile["profile_acceleration"] > top[1]:
+        raise DeviceRefusedError(
+            device.where,
+            f"profile {profile} is above the servo's own velocity or acceleration limit {top}",
+            "Lower rotation.velocity_deg_per_s or rotation.acceleration_deg_per_s2, or raise the servo's limits",
+        )
+    measured = await _measure(device, calibration)
+    goal = {
+        "goal_current": wanted["current_limit"],
+        "goal_velocity": limits["velocity_limit"],
+        **profile,
+        "goal_position": measured,
+    }
+    await device.write_block(device.arm_block, goal)
+    await device.write("bus_watchdog", watchdog_counts(settings))
+    await device.confirm({k: v for k, v in goal.items() if k != "goal_current"}, device.goal_block)
+    await device.torque(True)
+    await device.confirm({"bus_watchdog": watchdog_counts(settings), "goal_position": measured}, device.goal_block)
+    return measured
+
+
+async def _measure(device: Ph54Device, calibration: Calibration) -> int:
+    """Present position of a blade that stands inside its limits."""
+    sample, _ = await device.read_block(device.telemetry_block)
+    counts = sample["present_position"]
+    if not calibration.needs_turns:  # in position mode torque-on resets the count to within one turn
+        half = calibration.pulses_per_turn // 2
+        counts = (counts + half) % calibration.pulses_per_turn - half
+    angle_deg = calibration.blade_deg(counts)
+    speed = calibration.blade_deg_per_s(sample["present_velocity"])
+    if abs(speed) > _STILL_DEG_PER_S:
+        raise DeviceRefusedError(device.where, f"the blade turns at {speed:+.1f} °/s", "Arm when it stands still")
+    if not calibration.within_limits(angle_deg, _JUMP_DEG):
+        raise DeviceRefusedError(
+            device.where,
+            f"the blade is at {angle_deg:+.1f}°, outside its limits {calibration.min_deg:g}…{calibration.max_deg:g}°",
+            "Turn it back by hand, or check rotation.zero_deg and the limits",
+        )
+    return counts
