@@ -1,0 +1,1 @@
+"""The rows of the fault catalogue, one module for each kind of device."""
