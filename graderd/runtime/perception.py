@@ -48,11 +48,15 @@ class PerceptionWorker:
         blade: BladeGeometry,
         clock: Clock,
         command: tuple[str, ...] = (sys.executable, "-m", WORKER_MODULE),
+        start_grace_s: float = START_GRACE_S,
+        back_off_s: tuple[float, ...] = BACK_OFF_S,
     ) -> None:
         self._start = Start(camera=camera, calibration=calibration, perception=perception, blade=blade)
         self._camera = camera
         self._clock = clock
         self._command = command
+        self._start_grace_s = start_grace_s
+        self._back_off_s = back_off_s
         self._process: asyncio.subprocess.Process | None = None
         self._newest: SoilObservation | None = None
         self._taken = True
@@ -146,7 +150,8 @@ class PerceptionWorker:
         if self._preview is None or self._preview.done():
             self._preview = asyncio.get_running_loop().create_future()
             self._write(PreviewRequest())
-        return await asyncio.wait_for(asyncio.shield(self._preview), timeout_s)
+        async with asyncio.timeout(timeout_s):
+            return await asyncio.shield(self._preview)
 
     def _write(self, message: BaseModel) -> None:
         process = self._process
@@ -163,7 +168,7 @@ class PerceptionWorker:
                 self._restarts_n += 1
                 self._opens_without_frame_n += 1
                 self._restarted_s = self._clock.now_s()
-                pause_s = BACK_OFF_S[min(self._opens_without_frame_n, len(BACK_OFF_S)) - 1]
+                pause_s = self._back_off_s[min(self._opens_without_frame_n, len(self._back_off_s)) - 1]
                 log.warning("perception worker ended (restart %d in %.1f s)", self._restarts_n, pause_s)
                 await asyncio.sleep(pause_s)
         finally:
@@ -171,11 +176,18 @@ class PerceptionWorker:
 
     async def _one_child(self) -> None:
         reset_first = self._opens_without_frame_n == RESET_BEFORE_OPEN_N - 1
-        self._opened, self._trouble = None, None
-        self._last_word_s = self._clock.now_s() + START_GRACE_S - self._camera.restart_s
-        self._process = await asyncio.create_subprocess_exec(
-            *self._command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=MAX_LINE_BYTES
+        self._opened = None
+        self._last_word_s = self._clock.now_s() + self._start_grace_s - self._camera.restart_s
+        starting = asyncio.ensure_future(
+            asyncio.create_subprocess_exec(
+                *self._command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=MAX_LINE_BYTES
+            )
         )
+        try:
+            await asyncio.shield(starting)
+        finally:
+            # Cancelled half-way, the child would be left running: wait for it, run() kills it on the way out.
+            self._process = await starting
         assert self._process.stdin is not None  # asked for above
         assert self._process.stdout is not None
         start = self._start.model_copy(update={"reset_first": reset_first})
@@ -191,7 +203,8 @@ class PerceptionWorker:
         """Handle the child's next line. False: it ended, spoke nonsense or has been silent for too long."""
         silent_s = self._clock.now_s() - self._last_word_s
         try:
-            line = await asyncio.wait_for(lines.readline(), max(0.05, self._camera.restart_s - silent_s))
+            async with asyncio.timeout(max(0.05, self._camera.restart_s - silent_s)):
+                line = await lines.readline()
         except TimeoutError:
             self._killed_hung = True
             log.warning("perception worker said nothing for %.1f s: killing it", self._camera.restart_s)
@@ -217,7 +230,7 @@ class PerceptionWorker:
             self._trouble = None
             self._opens_without_frame_n = 0
         elif isinstance(message, Opened):
-            self._opened = message
+            self._opened, self._trouble = message, None
             log.info("camera open: %s", message.description)
         elif isinstance(message, Trouble):
             if self._trouble is None or self._trouble.message != message.message:

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-from drivers.rig.control import RigControl
 
+from drivers.rig.control import RigControl
 from graderd.core.status import Status
 from graderd.runtime.app.show import Show, make_show
 from graderd.runtime.app.sim import RigProcess, new_rig_directory
@@ -110,7 +110,8 @@ async def _machine(directory: Path, show: Show) -> AsyncIterator[httpx.AsyncClie
         if daemon.returncode is None:
             daemon.terminate()
         try:
-            await asyncio.wait_for(daemon.wait(), 5.0)
+            async with asyncio.timeout(5.0):
+                await daemon.wait()
         except TimeoutError:
             daemon.kill()
             await daemon.wait()
@@ -121,7 +122,8 @@ async def _answering(client: httpx.AsyncClient, daemon: asyncio.subprocess.Proce
     deadline_s = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < deadline_s:
         if daemon.returncode is not None:
-            raise DemoFailedError(f"the daemon ended at its start: {log_path.read_text(errors='replace')[-500:]}")
+            said = await asyncio.to_thread(log_path.read_text, errors="replace")
+            raise DemoFailedError(f"the daemon ended at its start: {said[-500:]}")
         with contextlib.suppress(httpx.TransportError):
             if (await client.get("/v1/status")).status_code == 200:
                 return

@@ -1,0 +1,151 @@
+"""The perception ladder, with children that misbehave as camera libraries do. Real processes, short times."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+
+from graderd.core.blade import BladeGeometry
+from graderd.core.zones import Zone
+from graderd.hal.clock import SystemClock
+from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.settings import CameraSettings
+from graderd.perception.settings import CameraCalibration, PerceptionSettings
+from graderd.runtime.perception import PerceptionWorker
+
+CAMERA = CameraSettings(source="rig", path="nowhere", stale_s=0.3, restart_s=0.8)
+DEADLINE_S = 20.0
+
+PRELUDE = """
+import json, os, sys, time
+start = json.loads(sys.stdin.readline())
+log = open(LOG, "a"); log.write(json.dumps({"pid": os.getpid(), "reset": start["reset_first"]}) + "\\n"); log.close()
+starts = len(open(LOG).readlines())
+def say(**message):
+    sys.stdout.write(json.dumps(message) + "\\n"); sys.stdout.flush()
+def opened():
+    say(kind="opened", description="fake camera", settings_read_back={"gain": 1.0}, not_kept=[])
+def frame(n=0, faults=()):
+    say(kind="observed", observation={"capture_s": time.monotonic(), "zone": "left", "confidence": 0.9,
+        "reason": "", "frame_number": n, "faults": list(faults)})
+"""
+
+
+@asynccontextmanager
+async def worker(tmp_path: Path, body: str, camera: CameraSettings = CAMERA) -> AsyncIterator[PerceptionWorker]:
+    """A supervised child that runs ``body`` after the prelude."""
+    script = tmp_path / "child.py"
+    script.write_text(f"LOG = {str(tmp_path / 'starts')!r}\n" + PRELUDE + body, encoding="utf-8")
+    eyes = PerceptionWorker(
+        camera,
+        CameraCalibration(),
+        PerceptionSettings(),
+        BladeGeometry(),
+        SystemClock(),
+        command=(sys.executable, str(script)),
+        start_grace_s=10.0,
+        back_off_s=(0.05,),
+    )
+    task = asyncio.create_task(eyes.run(), name="perception")
+    try:
+        yield eyes
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(DEADLINE_S):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+def conditions(eyes: PerceptionWorker) -> set[str]:
+    return {fault.condition for fault in eyes.faults()}
+
+
+def starts(tmp_path: Path) -> list[str]:
+    path = tmp_path / "starts"
+    return path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+
+
+async def test_frames_flow_and_each_is_taken_once(tmp_path: Path) -> None:
+    async with worker(tmp_path, "opened()\nn = 0\nwhile True:\n    frame(n); n += 1; time.sleep(0.03)\n") as eyes:
+        await until(lambda: eyes.newest is not None and eyes.newest.frame_number > 3)
+        first = eyes.take_observation()
+        assert first is not None
+        assert first.zone is Zone.LEFT
+        assert eyes.take_observation() is None or eyes.newest is not first
+        await until(lambda: not conditions(eyes))
+        assert eyes.status().lifecycle is Lifecycle.ACTIVE
+        assert eyes.status().description == "fake camera"
+        assert eyes.frames_per_s > 1
+
+
+async def test_frames_that_stop_are_unknown_at_once_and_the_child_is_replaced(tmp_path: Path) -> None:
+    body = "opened()\nfor n in range(5):\n    frame(n); time.sleep(0.03)\ntime.sleep(3600)\n"
+    async with worker(tmp_path, body) as eyes:
+        await until(lambda: eyes.newest is not None)
+        await until(lambda: "stale" in conditions(eyes))
+        assert eyes.take_observation() is None
+        await until(lambda: len(starts(tmp_path)) >= 2)
+        await until(lambda: conditions(eyes) & {"worker_hung"} == {"worker_hung"})
+        assert eyes.status().restarts_n >= 1
+
+
+async def test_a_library_call_that_never_returns_at_the_start(tmp_path: Path) -> None:
+    camera = CAMERA.model_copy(update={"restart_s": 0.5})
+    async with worker(tmp_path, "opened()\ntime.sleep(3600)\n", camera) as eyes:
+        await until(lambda: len(starts(tmp_path)) >= 3)
+        assert "stale" in conditions(eyes)
+        assert eyes.newest is None
+
+
+async def test_the_hardware_is_reset_before_the_third_open_and_told(tmp_path: Path) -> None:
+    body = 'say(kind="trouble", condition="missing", message="no RealSense camera", final=True)\nsys.exit(4)\n'
+    async with worker(tmp_path, body) as eyes:
+        await until(lambda: len(starts(tmp_path)) >= 4)
+        assert ['"reset": true' in line for line in starts(tmp_path)[:4]] == [False, False, True, False]
+        await until(lambda: "camera reset" in eyes.status().rung)
+        (missing,) = [fault for fault in eyes.faults() if fault.condition == "missing"]
+        assert missing.detail == "no RealSense camera"
+
+
+async def test_alive_but_without_frames_goes_up_the_ladder_too(tmp_path: Path) -> None:
+    body = 'opened()\nwhile True:\n    say(kind="trouble", condition="stale", message="no frame"); time.sleep(0.1)\n'
+    async with worker(tmp_path, body) as eyes:
+        await until(lambda: len(starts(tmp_path)) >= 2)
+        assert "stale" in conditions(eyes)
+
+
+async def test_it_comes_back_when_the_camera_does(tmp_path: Path) -> None:
+    body = "if starts < 3:\n    sys.exit(1)\nopened()\nn = 0\nwhile True:\n    frame(n); n += 1; time.sleep(0.03)\n"
+    async with worker(tmp_path, body) as eyes:
+        await until(lambda: eyes.newest is not None)
+        assert len(starts(tmp_path)) == 3
+        assert "stale" not in conditions(eyes)
+
+
+async def test_nonsense_from_the_child_ends_it(tmp_path: Path) -> None:
+    async with worker(
+        tmp_path, 'opened()\nsys.stdout.write("hello\\n"); sys.stdout.flush()\ntime.sleep(3600)\n'
+    ) as eyes:
+        await until(lambda: len(starts(tmp_path)) >= 2)
+        assert eyes.newest is None
+
+
+async def test_faults_of_the_picture_are_passed_on(tmp_path: Path) -> None:
+    body = 'opened()\nwhile True:\n    frame(0, [{"condition": "black", "detail": "2 %"}]); time.sleep(0.03)\n'
+    async with worker(tmp_path, body) as eyes:
+        await until(lambda: "black" in conditions(eyes))
+
+
+async def test_cancelling_leaves_no_child(tmp_path: Path) -> None:
+    async with worker(tmp_path, "opened()\nwhile True:\n    frame(); time.sleep(0.03)\n") as eyes:
+        await until(lambda: eyes.newest is not None)
+        pid = int(starts(tmp_path)[-1].split('"pid": ')[1].split(",")[0])
+    assert not Path(f"/proc/{pid}").exists()
