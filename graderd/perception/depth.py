@@ -19,6 +19,7 @@ from graderd.perception.geometry import F32, F64, View
 from graderd.perception.registration import BladeFinder, BladeFix, Ground, GroundFit
 from graderd.perception.settings import DecisionSettings, DepthSettings
 
+NOMINAL_WIDTH_PX = 848
 MAX_SOIL_M = 0.45
 """What stands higher than this above the ground is machine, not soil."""
 FACE_MARGIN_M = 0.025
@@ -49,7 +50,9 @@ class DepthJudge:
         self._decision = decision
         self._blade = blade
         self._position = view.position_m.astype(np.float32)
-        rays = view.rays(settings.stride_px)
+        # The stride is meant for a picture 848 pixels across; a smaller one is sampled as densely on the ground.
+        self._stride = max(1, round(settings.stride_px * view.lens.width / NOMINAL_WIDTH_PX))
+        rays = view.rays(self._stride)
         self._rays = tuple(np.ascontiguousarray(rays[..., axis]).ravel() for axis in range(3))
         self._focal_px = view.lens.fx
         self._ground = GroundFit(settings.ground_offset_limit_m, settings.ground_slope_limit_deg)
@@ -93,7 +96,7 @@ class DepthJudge:
         return verdict
 
     def _points(self, depth_mm: DepthImage) -> tuple[F32, F32, F32]:
-        stride = self._settings.stride_px
+        stride = self._stride
         depth = depth_mm[stride // 2 :: stride, stride // 2 :: stride].ravel()
         valid = np.flatnonzero(depth)
         range_m = depth[valid].astype(np.float32) * np.float32(0.001)

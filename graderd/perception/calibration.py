@@ -1,0 +1,232 @@
+"""Where the camera really sits: solved from a few frames of the empty blade at known angles.
+
+What is solved: the colour stream's pose (six numbers), and of the blade its length, its height and how far its edge
+lies ahead of the rotation axis. The depth stream moves along with the colour stream: their relation is the camera's
+own and stays. Evidence: the ground (it is z = 0), the hollow face, its ends and its upper edge in the depth pictures;
+the blade's outline in the colour pictures. The rotation axis is found because the face is seen at several angles.
+
+Method: Gauss-Newton with a robust weight; after every step the evidence is looked for again, in a narrower band round
+the blade as it is known by then (as in iterative closest point, Besl & McKay 1992, IEEE PAMI 14(2)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graderd.core.blade import BladeGeometry
+from graderd.hal.camera import Frame, StreamPose
+from graderd.perception.calibration_evidence import ColorEvidence, DepthEvidence, collect_color, collect_depth
+from graderd.perception.geometry import F64, View
+from graderd.perception.settings import CameraCalibration, StreamCalibration
+
+POSE = ("position_x_m", "position_y_m", "position_z_m", "pitch_down_deg", "yaw_deg", "roll_deg")
+GEOMETRY = ("x_offset_m", "length_m", "height_m")
+STEPS = np.array([1e-4, 1e-4, 1e-4, 5e-3, 5e-3, 5e-3, 1e-4, 1e-4, 1e-4])
+"""Steps of the numerical derivatives: metres and degrees."""
+BANDS_M = (0.14, 0.10, 0.07, 0.05, 0.035, 0.025, 0.02, 0.015, 0.012)
+"""How far from the blade's place the evidence is looked for, round by round."""
+DEPTH_SIGMA_M = 0.003
+COLOR_SIGMA_PX = 1.0
+PRIOR_SIGMA = np.array([0.5, 0.5, 0.5, 30.0, 30.0, 30.0, 0.02, 0.03, 0.03])
+"""How far a number may plausibly be from where it starts: metres and degrees. Decides only what is not seen."""
+MIN_FRAMES_N = 3
+MIN_SPAN_DEG = 20.0
+MAX_RESIDUAL_MM = 12.0
+MAX_RESIDUAL_PX = 6.0
+MAX_UNCERTAIN_MM = 10.0
+MAX_UNCERTAIN_DEG = 1.0
+
+
+class CalibrationError(Exception):
+    """The frames do not give a calibration; the message says why and what to do."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EmptyBlade:
+    """One frame of the empty blade and the angle it was measured at."""
+
+    frame: Frame
+    blade_angle_deg: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationResult:
+    """The solved calibration and blade, how well they fit, and how sure each solved number is (1 sigma)."""
+
+    calibration: CameraCalibration
+    blade: BladeGeometry
+    residual_mm: float | None
+    residual_px: float | None
+    uncertainty: dict[str, float]
+    frames_n: int
+
+
+def calibrate(
+    views: Sequence[EmptyBlade], start: CameraCalibration, blade: BladeGeometry, when: str = ""
+) -> CalibrationResult:
+    """Solve camera pose and blade geometry, beginning at ``start`` (right within some 10 cm and 8 degrees).
+
+    ``when`` is written into the calibration as ``calibrated_at``.
+
+    Raises:
+        CalibrationError: too few frames, angles too close together, blade not found, or a bad fit.
+    """
+    _check(views)
+    solver = _Solver(views, start, blade)
+    for band_m in BANDS_M:
+        solver.step(band_m)
+    return solver.result(when)
+
+
+def with_pose(start: CameraCalibration, color_pose: dict[str, float]) -> CameraCalibration:
+    """``start`` with the colour stream moved to ``color_pose`` (keys of POSE); the depth stream moves along."""
+    color = start.color.model_copy(update=color_pose)
+    old, new = start.color.pose(start.mounting), color.pose(start.mounting)
+    depth = start.depth.pose(start.mounting)
+    old_r, new_r = np.asarray(old.rotation), np.asarray(new.rotation)
+    rotation = new_r @ old_r.T @ np.asarray(depth.rotation)
+    offset = old_r.T @ (np.asarray(depth.position_m) - np.asarray(old.position_m))
+    position = np.asarray(new.position_m) + new_r @ offset
+    rows = tuple((float(row[0]), float(row[1]), float(row[2])) for row in rotation)
+    pose = StreamPose((float(position[0]), float(position[1]), float(position[2])), (rows[0], rows[1], rows[2]))
+    moved = StreamCalibration.from_pose(start.depth.intrinsics(), pose, start.mounting)
+    return start.model_copy(update={"color": color, "depth": moved})
+
+
+def _check(views: Sequence[EmptyBlade]) -> None:
+    if len(views) < MIN_FRAMES_N:
+        raise CalibrationError(f"{len(views)} frames, at least {MIN_FRAMES_N} are needed; take more")
+    angles = [view.blade_angle_deg for view in views]
+    if max(angles) - min(angles) < MIN_SPAN_DEG:
+        raise CalibrationError(
+            f"the angles span {max(angles) - min(angles):.0f} deg, at least {MIN_SPAN_DEG:.0f} are needed to find the "
+            "rotation axis; turn the blade further between the frames"
+        )
+
+
+class _Solver:
+    def __init__(self, views: Sequence[EmptyBlade], start: CameraCalibration, blade: BladeGeometry) -> None:
+        self._views = views
+        self._start = start
+        self._blade = blade
+        pose = [float(getattr(start.color, name)) for name in POSE]
+        geometry = [float(getattr(blade, name)) for name in GEOMETRY]
+        self._first = np.array(pose + geometry)
+        self._p = self._first.copy()
+        self._depth: list[DepthEvidence] = []
+        self._color: list[ColorEvidence] = []
+        self._normal: F64 = np.eye(len(self._p))
+
+    def _model(self, p: F64) -> tuple[CameraCalibration, BladeGeometry]:
+        calibration = with_pose(self._start, dict(zip(POSE, map(float, p[:6]), strict=True)))
+        return calibration, self._blade.model_copy(update=dict(zip(GEOMETRY, map(float, p[6:]), strict=True)))
+
+    def _views_of(self, frame: Frame, calibration: CameraCalibration) -> tuple[View, View]:
+        color = frame.color_intrinsics or calibration.color.intrinsics().scaled(*frame.color_bgr.shape[1::-1])
+        depth = calibration.depth.intrinsics()
+        if frame.depth_mm is not None:
+            depth = frame.depth_intrinsics or depth.scaled(*frame.depth_mm.shape[::-1])
+        mounting = calibration.mounting
+        return View(color, calibration.color.pose(mounting)), View(depth, calibration.depth.pose(mounting))
+
+    def step(self, band_m: float) -> None:
+        """Look for the evidence within ``band_m``, then two Gauss-Newton steps on it."""
+        calibration, blade = self._model(self._p)
+        self._depth, self._color = [], []
+        for view in self._views:
+            color_view, depth_view = self._views_of(view.frame, calibration)
+            if view.frame.depth_mm is not None:
+                self._depth.append(collect_depth(view.frame.depth_mm, depth_view, blade, view.blade_angle_deg, band_m))
+            if band_m <= 0.05 or view.frame.depth_mm is None:
+                found = collect_color(view.frame.color_bgr, color_view, blade, view.blade_angle_deg, band_m)
+                self._color.append(found)
+        if sum(len(e.face) for e in self._depth) + 10 * sum(len(e.at_px) for e in self._color) < 100 * len(self._views):
+            raise CalibrationError(
+                "the blade was not found where the starting pose says; clear the soil before the blade, "
+                "or enter the measured pose with --pose"
+            )
+        for _ in range(2):
+            self._gauss_newton()
+
+    def _residuals(self, p: F64) -> F64:
+        calibration, blade = self._model(p)
+        parts: list[F64] = []
+        for evidence, view in zip(self._depth, self._with_depth(), strict=True):
+            depth_view = self._views_of(view.frame, calibration)[1]
+            parts += [r / DEPTH_SIGMA_M for r in evidence.residuals_m(depth_view, blade)]
+        colored = self._views if len(self._color) == len(self._views) else self._without_depth()
+        for found, view in zip(self._color, colored, strict=True):
+            color_view = self._views_of(view.frame, calibration)[0]
+            parts.append(found.residuals_px(color_view, blade) / COLOR_SIGMA_PX)
+        return np.concatenate(parts)
+
+    def _with_depth(self) -> list[EmptyBlade]:
+        return [view for view in self._views if view.frame.depth_mm is not None]
+
+    def _without_depth(self) -> list[EmptyBlade]:
+        return [view for view in self._views if view.frame.depth_mm is None]
+
+    def _gauss_newton(self) -> None:
+        r = self._residuals(self._p)
+        jacobian = np.empty((r.size, self._p.size))
+        for i, h in enumerate(STEPS):
+            ahead, back = self._p.copy(), self._p.copy()
+            ahead[i] += h
+            back[i] -= h
+            jacobian[:, i] = (self._residuals(ahead) - self._residuals(back)) / (2 * h)
+        weight = 1.0 / (1.0 + (r / 3.0) ** 2)  # Cauchy: an edge of soil or a hose has little say
+        prior = np.diag(1.0 / PRIOR_SIGMA**2)
+        self._normal = jacobian.T @ (jacobian * weight[:, None]) + prior
+        pull = prior @ (self._first - self._p)
+        self._p = self._p + np.linalg.solve(self._normal, -jacobian.T @ (weight * r) + pull)
+
+    def result(self, when: str) -> CalibrationResult:
+        """Residuals, uncertainties and the final judgement."""
+        calibration, blade = self._model(self._p)
+        parts_mm: list[F64] = []
+        for evidence, view in zip(self._depth, self._with_depth(), strict=True):
+            depth_view = self._views_of(view.frame, calibration)[1]
+            parts_mm += [part * 1000 for part in evidence.residuals_m(depth_view, blade)]
+        parts_px = [
+            found.residuals_px(self._views_of(view.frame, calibration)[0], blade)
+            for found, view in zip(self._color, self._views, strict=True)
+        ]
+        residual_mm = _robust_rms(np.concatenate(parts_mm)) if parts_mm else None
+        edges = np.concatenate(parts_px) if parts_px else np.zeros(0)
+        residual_px = _robust_rms(edges) if edges.size >= 10 * len(self._views) else None
+        # Neighbouring pixels err together: count a tenth of them.
+        sigma = np.sqrt(np.diag(np.linalg.inv(self._normal)) * 10.0)
+        uncertainty = dict(zip((*POSE, *GEOMETRY), map(float, sigma), strict=True))
+        self._judge(residual_mm, residual_px, uncertainty)
+        calibration = calibration.model_copy(
+            update={
+                "calibrated_at": when,
+                "residual_mm": round(residual_mm or 0.0, 3),
+                "residual_px": round(residual_px or 0.0, 3),
+            }
+        )
+        return CalibrationResult(calibration, blade, residual_mm, residual_px, uncertainty, len(self._views))
+
+    def _judge(self, residual_mm: float | None, residual_px: float | None, uncertainty: dict[str, float]) -> None:
+        if residual_mm is not None and residual_mm > MAX_RESIDUAL_MM:
+            raise CalibrationError(
+                f"the blade fits to {residual_mm:.1f} mm only, {MAX_RESIDUAL_MM:.0f} mm is asked; is it empty, and are "
+                "the angles those of the frames?"
+            )
+        if residual_mm is None and (residual_px is None or residual_px > MAX_RESIDUAL_PX):
+            raise CalibrationError("the blade's outline does not fit the colour pictures; start nearer with --pose")
+        for name, value in uncertainty.items():
+            limit = MAX_UNCERTAIN_DEG if name.endswith("_deg") else MAX_UNCERTAIN_MM / 1000
+            if value > limit:
+                raise CalibrationError(f"{name} stays uncertain by {value:.3f}; take frames at more angles")
+
+
+def _robust_rms(values: F64) -> float:
+    """Root mean square of the better 95 %."""
+    if values.size == 0:
+        return 0.0
+    kept = np.sort(np.abs(values))[: max(1, int(0.95 * values.size))]
+    return float(np.sqrt(np.mean(kept**2)))

@@ -1,0 +1,185 @@
+"""What one frame of the empty blade tells about the camera's place: depth points on known surfaces, edges in colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from graderd.core.blade import BladeGeometry, blade_coordinates
+from graderd.hal.camera import DepthImage
+from graderd.perception.geometry import F64, U8, View, blade_points_m, face_setback_m
+
+MAX_FACE_POINTS_N = 700
+MAX_GROUND_POINTS_N = 700
+EDGE_POINTS_N = 48
+ENDS_BANDS_N = 10
+TOP_BANDS_N = 16
+MIN_EDGE_GRAY = 6.0
+"""An edge weaker than this (grey levels over two pixels) is no edge."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthEvidence:
+    """Points in the optical frame (N x 3, m) that lie on the face, the ground, the two ends and the upper edge."""
+
+    angle_deg: float
+    face: F64
+    ground: F64
+    left_end: F64
+    right_end: F64
+    top: F64
+
+    def residuals_m(self, view: View, blade: BladeGeometry) -> list[F64]:
+        """How far each group lies from where it belongs (m)."""
+        _, d, z = _in_blade(self.face, view, self.angle_deg)
+        face = d - blade.x_offset_m + face_setback_m(blade, z)
+        ground = _in_blade(self.ground, view, self.angle_deg)[2]
+        left = _in_blade(self.left_end, view, self.angle_deg)[0] - blade.length_m / 2
+        right = _in_blade(self.right_end, view, self.angle_deg)[0] + blade.length_m / 2
+        top = _in_blade(self.top, view, self.angle_deg)[2] - (blade.bottom_z_m + blade.height_m)
+        return [face, ground, left, right, top]
+
+
+def _in_blade(points: F64, view: View, angle_deg: float) -> tuple[F64, F64, F64]:
+    at = points @ view.rotation.T + view.position_m
+    s, d = blade_coordinates(at[:, 0], at[:, 1], angle_deg)
+    return s, d, at[:, 2]
+
+
+def collect_depth(
+    depth_mm: DepthImage, view: View, blade: BladeGeometry, angle_deg: float, band_m: float
+) -> DepthEvidence:
+    """Find the evidence in one depth picture, within ``band_m`` of where ``view`` and ``blade`` put it."""
+    lens = view.lens
+    rows, columns = np.nonzero(depth_mm)
+    z_optical = depth_mm[rows, columns].astype(np.float64) / 1000.0
+    flat = View(lens, view.pose).rays().astype(np.float64)[rows, columns] @ view.rotation  # optical rays again
+    points = flat * z_optical[:, None]
+    s, d, z = _in_blade(points, view, angle_deg)
+    half, top = blade.length_m / 2, blade.bottom_z_m + blade.height_m
+    face = d - blade.x_offset_m + face_setback_m(blade, z)
+    on_face = np.abs(face) < band_m
+    body = on_face & (np.abs(s) < half - 0.02) & (z > blade.bottom_z_m + 0.03) & (z < top - 0.015)
+    clear = (np.abs(s) > half + 0.08) | (d > 0.12) | (d < -0.25)
+    ground = (np.abs(z) < band_m) & clear & (np.hypot(s, d) < 1.3)
+    wide = on_face & (np.abs(s) < half + band_m)
+    # One pixel covers this much of the blade: an extreme point lies half of it inside the true end.
+    pixel_m = float(np.median(z_optical[body])) / lens.fx if body.any() else 0.002
+    left, right = _ends(points, s, z, wide, blade, 0.5 * pixel_m, view, angle_deg)
+    return DepthEvidence(
+        angle_deg,
+        _thinned(points[body], MAX_FACE_POINTS_N),
+        _thinned(points[ground], MAX_GROUND_POINTS_N),
+        left,
+        right,
+        _top(points, s, z, wide & (np.abs(s) < half - 0.02) & (z < top + band_m), blade, 0.5 * pixel_m, view),
+    )
+
+
+def _thinned(points: F64, most: int) -> F64:
+    """Every n-th point, so that at most about ``most`` remain."""
+    return points[:: max(1, -(-len(points) // most))]
+
+
+def _ends(
+    points: F64, s: F64, z: F64, wide: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], blade: BladeGeometry,
+    grow_m: float, view: View, angle_deg: float,
+) -> tuple[F64, F64]:  # fmt: skip
+    """The outermost face points on both sides, per band of height; each moved outwards by half a pixel."""
+    lows = np.linspace(blade.bottom_z_m + 0.03, blade.bottom_z_m + blade.height_m - 0.02, ENDS_BANDS_N + 1)
+    along = blade_points_m(blade, angle_deg, np.array([1.0]), np.array([0.0]), np.array([0.0]))[0]
+    along -= blade_points_m(blade, angle_deg, np.array([0.0]), np.array([0.0]), np.array([0.0]))[0]
+    outwards = along @ view.rotation * grow_m
+    left, right = [], []
+    for low, high in pairwise(lows):
+        inside = np.flatnonzero(wide & (z >= low) & (z < high))
+        if inside.size < 40:
+            continue
+        order = inside[np.argsort(s[inside])]
+        right.append(points[order[2]] - outwards)  # the third: a flying pixel or two do no harm
+        left.append(points[order[-3]] + outwards)
+    return np.reshape(left, (-1, 3)), np.reshape(right, (-1, 3))
+
+
+def _top(
+    points: F64, s: F64, z: F64, near: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], blade: BladeGeometry,
+    grow_m: float, view: View,
+) -> F64:  # fmt: skip
+    """The highest face points, per band along the blade."""
+    half = blade.length_m / 2 - 0.03
+    lows = np.linspace(-half, half, TOP_BANDS_N + 1)
+    up = np.array([0.0, 0.0, grow_m]) @ view.rotation
+    found = []
+    for low, high in pairwise(lows):
+        inside = np.flatnonzero(near & (s >= low) & (s < high))
+        if inside.size < 40:
+            continue
+        order = inside[np.argsort(z[inside])]
+        found.append(points[order[-3]] + up)
+    return np.reshape(found, (-1, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColorEvidence:
+    """Where edges were found near the blade's outline: for outline parameters, the pixel and the outline's normal."""
+
+    angle_deg: float
+    side: np.ndarray[tuple[int, ...], np.dtype[np.int8]]
+    share: F64
+    at_px: F64
+    normal: F64
+
+    def residuals_px(self, view: View, blade: BladeGeometry) -> F64:
+        """Distance along the normal between the found edges and the outline as ``view`` and ``blade`` put it (px)."""
+        if len(self.at_px) == 0:
+            return np.zeros(0)
+        there = view.project(_outline_m(blade, self.angle_deg, self.side, self.share))
+        return np.asarray(((there - self.at_px) * self.normal).sum(axis=1), dtype=np.float64)
+
+
+TOP, LEFT_END, RIGHT_END = 0, 1, 2
+
+
+def _outline_m(
+    blade: BladeGeometry, angle_deg: float, side: np.ndarray[tuple[int, ...], np.dtype[np.int8]], share: F64
+) -> F64:
+    """Points of the face's outline: upper edge (share from right to left), the ends (share from bottom to top)."""
+    half, low = blade.length_m / 2, blade.bottom_z_m
+    s = np.where(side == TOP, (2 * share - 1) * half, np.where(side == LEFT_END, half, -half))
+    z = np.where(side == TOP, low + blade.height_m, low + share * blade.height_m)
+    return blade_points_m(blade, angle_deg, s, -face_setback_m(blade, z), z)
+
+
+def collect_color(color_bgr: U8, view: View, blade: BladeGeometry, angle_deg: float, band_m: float) -> ColorEvidence:
+    """Find the outline's edges in one colour picture, within ``band_m`` (at the blade) of where it should be."""
+    gray = cv2.GaussianBlur(cv2.cvtColor(color_bgr, cv2.COLOR_BGR2GRAY), (0, 0), 1.2).astype(np.float32)
+    share = np.linspace(0.04, 0.96, EDGE_POINTS_N)
+    side = np.repeat(np.array([TOP, LEFT_END, RIGHT_END], dtype=np.int8), EDGE_POINTS_N)
+    shares = np.tile(share, 3)
+    shares[EDGE_POINTS_N:] = np.tile(np.linspace(0.35, 0.95, EDGE_POINTS_N), 2)  # soil and shade hide the ends' feet
+    at = view.project(_outline_m(blade, angle_deg, side, shares))
+    nearby = view.project(_outline_m(blade, angle_deg, side, shares + 0.01))
+    tangent = nearby - at
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    normal = np.column_stack((-tangent[:, 1], tangent[:, 0]))
+    distance = float(np.linalg.norm(view.position_m[:2])) or 1.0
+    reach = int(np.clip(band_m * view.lens.fx / distance * 0.7, 4, 60))
+    offsets = np.arange(-reach - 1, reach + 2, dtype=np.float64)
+    spots = at[:, None, :] + normal[:, None, :] * offsets[None, :, None]
+    sampled = cv2.remap(gray, spots[..., 0].astype(np.float32), spots[..., 1].astype(np.float32), cv2.INTER_LINEAR)
+    slope = np.abs(sampled[:, 2:] - sampled[:, :-2])
+    inside = np.isfinite(at).all(axis=1) & (at.min(axis=1) > reach + 2)
+    inside &= (at[:, 0] < gray.shape[1] - reach - 2) & (at[:, 1] < gray.shape[0] - reach - 2)
+    best = slope.argmax(axis=1)
+    strength = slope[np.arange(len(slope)), best]
+    keep = inside & (strength > MIN_EDGE_GRAY) & (best > 0) & (best < slope.shape[1] - 1)
+    index = np.flatnonzero(keep)
+    peak = best[index]
+    a, b, c = slope[index, peak - 1], slope[index, peak], slope[index, peak + 1]
+    shift = np.clip(0.5 * (a - c) / np.maximum(a - 2 * b + c, -1e9).clip(max=-1e-6), -0.5, 0.5)
+    offset = offsets[1 + peak] + shift
+    found = at[index] + normal[index] * offset[:, None]
+    return ColorEvidence(angle_deg, side[index], shares[index], found, normal[index])
