@@ -67,7 +67,8 @@ class RigControl:
             try:
                 self._writer.write(_line(command, params))
                 await self._writer.drain()
-                line = await asyncio.wait_for(self._reader.readline(), self._timeout_s)
+                async with asyncio.timeout(self._timeout_s):
+                    line = await self._reader.readline()
             except TimeoutError:
                 await self.close()  # an answer that comes later must not be taken for the next one's
                 raise DeviceTimeoutError(self._path, f"no answer to {command!r} for {self._timeout_s} s") from None

@@ -18,7 +18,7 @@ class Look(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
     sun_azimuth_deg: Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)] = 35.0
-    """Where the light comes from, seen from the blade: 0 = from ahead, counter-clockwise positive (90 = from the left)."""
+    """Where the light comes from, seen from the blade: 0 = from ahead, 90 = from the left."""
     sun_elevation_deg: Annotated[float, Field(ge=5, le=90, allow_inf_nan=False)] = 50.0
     sun_strength: Annotated[float, Field(ge=0, le=4, allow_inf_nan=False)] = 1.0
     ambient: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)] = 0.45

@@ -54,19 +54,20 @@ def soil_grain(rng: np.random.Generator, shape: tuple[int, int]) -> Image8:
     relief /= max(float(relief.std()), 1e-6)
     fine = noise(rng, shape, ((1.0, 1.0), (2.0, 1.0)))
     patches = noise(rng, shape, ((90.0, 1.0), (220.0, 1.0)))
-    return np.clip(128.0 + 22.0 * relief + 9.0 * fine + 7.0 * clods + 6.0 * patches, 0, 255).astype(np.uint8)
+    light = 128.0 + 22.0 * relief + 9.0 * fine + 7.0 * clods + 6.0 * patches
+    return np.asarray(np.clip(light, 0, 255), np.uint8)
 
 
 def wood_grain(rng: np.random.Generator, shape: tuple[int, int]) -> Image8:
     """Lightness of plywood boards: long fibres, stains and a joint every 1.2 m."""
-    fibres = rng.standard_normal((max(2, shape[0] // 60), shape[1])).astype(np.float32)
+    fibres = noise(rng, (max(2, shape[0] // 40), shape[1]), ((1.0, 0.6), (3.0, 1.0), (9.0, 1.0)))
     fibres = np.asarray(cv2.resize(fibres, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC), np.float32)
-    stains = noise(rng, shape, ((60.0, 1.0), (160.0, 1.0)))
-    fine = noise(rng, shape, ((1.0, 1.0),))
-    board = 128.0 + 10.0 * fibres + 9.0 * stains + 4.0 * fine
+    stains = noise(rng, shape, ((30.0, 0.6), (70.0, 1.0), (160.0, 1.0)))
+    fine = noise(rng, shape, ((1.0, 1.0), (2.0, 1.0)))
+    board = 128.0 + 6.0 * fibres + 9.0 * stains + 5.0 * fine
     joint = np.arange(shape[0]) % 480 < 2
     board[joint] *= 0.55
-    return np.clip(board, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(board, 0, 255), np.uint8)
 
 
 def palette(rgb: tuple[int, int, int], contrast: float, warm: float) -> Image8:
@@ -75,7 +76,7 @@ def palette(rgb: tuple[int, int, int], contrast: float, warm: float) -> Image8:
     bgr = np.array(rgb[::-1], np.float32)[None, :]
     grey = bgr.mean()
     tinted = bgr + np.maximum(light, 0.0) * warm * (grey - bgr)
-    return np.clip(tinted * (1.0 + contrast * light), 0, 255).astype(np.uint8)[:, None, :]
+    return np.asarray(np.clip(tinted * (1.0 + contrast * light), 0, 255)[:, None, :], np.uint8)
 
 
 def soil_palette(look: Look) -> Image8:

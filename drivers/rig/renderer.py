@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.rig.blade import EDGE_GAP_M, FACE_HEIGHT_M, LENGTH_M, BladePose
-from drivers.rig.look import Look
+from drivers.rig.look import BladeMaterial, Look
 from drivers.rig.optics import COLOR_INTRINSICS, COLOR_POSE, DEPTH_INTRINSICS, DEPTH_POSE
 from drivers.rig.paint import (
     TEXEL_M,
@@ -32,6 +32,8 @@ _BEHIND_M, _AHEAD_M = 2.0, 0.9
 """Extent of the ground map about the blade, along the vehicle; the camera stands 0.8 m ahead."""
 _BODY_M = 0.032
 """Depth behind the blade's face that soil lying against its hollow fills."""
+_SPILL_M = 0.08
+"""Where soil stands above the blade's top, it falls off behind it over this distance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,10 +145,8 @@ class Renderer:
         soil = state.heights_m[first:last].astype(np.float32)
         x_first = (first + 0.5) * cell - state.vehicle_x_m
         y_first = (0.5 * cell) - BED_WIDTH_M / 2.0
-        self._fill_hollow(soil, x_first, y_first, state)
-        fine = np.asarray(
-            cv2.resize(soil, (soil.shape[1] * 2, soil.shape[0] * 2), interpolation=cv2.INTER_CUBIC), np.float32
-        )
+        fine = _enlarge(soil)
+        self._lean_on_blade(soil, fine, x_first, y_first, state)
         x_first, y_first, cell = x_first - cell / 4.0, y_first - cell / 4.0, cell / 2.0
         soft = np.clip((fine - 0.001) / 0.010, 0.0, 1.0)
         rough = self.materials.rough(first * 2, fine.shape)
@@ -158,17 +158,21 @@ class Renderer:
         return _GroundMap(heights, tone.astype(np.uint8), x_first, y_first, cell)
 
     @staticmethod
-    def _fill_hollow(soil: Image32, x_first: float, y_first: float, state: SceneState) -> None:
-        """Continue the soil that leans on the blade into its hollow: the field knows the blade only as a wall."""
-        angle = math.radians(state.blade.angle_deg)
-        cos, sin = math.cos(angle), math.sin(angle)
-        x = (x_first + np.arange(soil.shape[0]) * state.cell_m)[:, None]
-        y = (y_first + np.arange(soil.shape[1]) * state.cell_m)[None, :]
-        ahead = y * sin + x * cos
-        body = (ahead <= 0.0) & (ahead >= -_BODY_M) & (np.abs(y * cos - x * sin) <= LENGTH_M / 2.0)
-        front = np.where(ahead > 0.0, soil, np.float32(0.0))
-        filled = np.asarray(cv2.dilate(front, np.ones((5, 5), np.uint8)))
-        soil[body] = np.maximum(soil[body], filled[body])
+    def _lean_on_blade(soil: Image32, fine: Image32, x_first: float, y_first: float, state: SceneState) -> None:
+        """Part the soil along the blade's face in ``fine``: the field knows the blade only as a wall of whole cells.
+
+        Soil ahead goes on into the hollow of the face, and over the top where it stands higher than the blade.
+        """
+        cell = state.cell_m
+        _, ahead = _blade_coordinates(soil.shape, x_first, y_first, cell, state.blade)
+        front = _enlarge(_extrapolate(soil, ahead > 0.0))
+        back = _enlarge(_extrapolate(soil, ahead < -1.5 * cell))
+        s, ahead = _blade_coordinates(fine.shape, x_first - cell / 4.0, y_first - cell / 4.0, cell / 2.0, state.blade)
+        near = (np.abs(s) <= LENGTH_M / 2.0) & (ahead <= 0.045) & (ahead >= -_SPILL_M)
+        top = np.float32(state.blade.height_m + FACE_HEIGHT_M)
+        spilt = np.where(front > top, front + np.minimum(ahead, 0.0), np.float32(0.0))
+        parted = np.where(ahead > -_BODY_M, np.minimum(front, np.maximum(top - 0.004, spilt)), np.maximum(back, spilt))
+        np.copyto(fine, np.where(ahead > 0.0, front, parted), where=near)
 
     def _light(
         self, heights: Image32, x_first: float, y_first: float, cell: float, blade: BladePose, look: Look
@@ -251,7 +255,7 @@ class Renderer:
         column = (np.abs(y + np.float32(BED_WIDTH_M / 2.0)) + rise) * texel
         picture = self.materials.floor(look, column, row)
         soil, grain = self.materials.soil(look, column, row)
-        is_soil = np.asarray(cv2.compare(share, cv2.subtract(grain, 40.0), cv2.CMP_GT))
+        is_soil = np.asarray(cv2.compare(share, np.maximum(grain, 40) - 40, cv2.CMP_GT))
         cv2.copyTo(soil, is_soil, picture)
         picture = np.asarray(cv2.multiply(picture, cv2.merge((light, light, light)), scale=1.0 / 127.5))
         self._paint_solids(picture, depth, stream, (*MACHINE, *state.props), look)
@@ -374,8 +378,11 @@ class Materials:
 
     def soil(self, look: Look, column: Image32, row: Image32) -> tuple[Image8, Image8]:
         """Soil colour at texture coordinates, and the lightness it comes from."""
-        grain = np.asarray(cv2.remap(self._grain, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT))
-        return np.asarray(cv2.LUT(cv2.merge((grain, grain, grain)), soil_palette(look))), grain
+        clods = cv2.remap(self._grain, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        # The same texture three and a half times smaller gives the grit that one texel a 2.5 mm cannot.
+        grit = cv2.remap(self._grain, column * 3.5, row * 3.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        grain = np.asarray(cv2.addWeighted(clods, 0.8, grit, 0.5, -0.3 * 128.0), np.uint8)
+        return np.asarray(cv2.LUT(cv2.merge((grain, grain, grain)), soil_palette(look)), np.uint8), grain
 
     def floor(self, look: Look, column: Image32, row: Image32) -> Image8:
         """Colour of the bed's floor and sides at texture coordinates."""
@@ -383,7 +390,7 @@ class Materials:
         board = cv2.remap(texture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         return np.asarray(cv2.LUT(cv2.merge((board, board, board)), ground_palette(look)))
 
-    def blade(self, material: str) -> Image32:
+    def blade(self, material: BladeMaterial) -> Image32:
         """Albedo of the blade's face."""
         if material not in self._blades:
             self._blades[material] = blade_paint(np.random.default_rng(self._seed + 2), material)
@@ -403,3 +410,35 @@ def sun_direction(look: Look) -> npt.NDArray[np.float32]:
 def _merge_depth(depth: Image32, hit: BladeHit) -> None:
     view = depth[hit.area]
     np.minimum(view, hit.depth_m, out=view)
+
+
+def _enlarge(field: Image32) -> Image32:
+    size = (field.shape[1] * 2, field.shape[0] * 2)
+    return np.asarray(cv2.resize(field, size, interpolation=cv2.INTER_CUBIC), np.float32)
+
+
+def _extrapolate(field: Image32, known: npt.NDArray[np.bool_]) -> Image32:
+    """``field`` smoothed where ``known``, elsewhere the mean of the known cells nearby (0 where there are none)."""
+    weight = known.astype(np.float32)
+    # The row of cells next to a slanting wall is ragged by the grid; its mean is what soil would look like.
+    smooth = np.asarray(cv2.blur(np.asarray(cv2.blur(field * weight, (3, 3))), (3, 3)), np.float32)
+    result = smooth / np.maximum(np.asarray(cv2.blur(np.asarray(cv2.blur(weight, (3, 3))), (3, 3))), np.float32(1e-6))
+    result *= weight
+    for size in (3, 9):
+        total = np.asarray(cv2.blur(weight, (size, size)), np.float32)
+        mean = np.asarray(cv2.blur(result * weight, (size, size)), np.float32) / np.maximum(total, np.float32(1e-6))
+        fresh = (weight == 0.0) & (total > 1e-6)
+        result = np.where(fresh, mean, result)
+        weight = np.where(fresh, np.float32(1.0), weight)
+    return np.asarray(result, np.float32)
+
+
+def _blade_coordinates(
+    shape: tuple[int, ...], x_first: float, y_first: float, cell_m: float, blade: BladePose
+) -> tuple[Image32, Image32]:
+    """Blade coordinates ``(s, d)`` of the cells of a map in the vehicle frame, metres."""
+    angle = math.radians(blade.angle_deg)
+    cos, sin = np.float32(math.cos(angle)), np.float32(math.sin(angle))
+    x = (np.float32(x_first) + np.arange(shape[0], dtype=np.float32) * np.float32(cell_m))[:, None]
+    y = (np.float32(y_first) + np.arange(shape[1], dtype=np.float32) * np.float32(cell_m))[None, :]
+    return y * cos - x * sin, y * sin + x * cos

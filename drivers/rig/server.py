@@ -157,7 +157,7 @@ class Rig:
             raise DeviceMissingError(
                 f"CAN channel {self._can_channel}",
                 str(error),
-                "Create it (ip link add dev vcan0 type vcan; ip link set vcan0 up), or leave --can out for an slcan pty",
+                "Create it (ip link add dev vcan0 type vcan; ip link set vcan0 up), or leave --can out",
             ) from error
 
     def _announce(self) -> None:
@@ -202,7 +202,8 @@ class Rig:
         )
         assert self._camera.stdout is not None
         try:
-            line = await asyncio.wait_for(self._camera.stdout.readline(), _CAMERA_START_S)
+            async with asyncio.timeout(_CAMERA_START_S):
+                line = await self._camera.stdout.readline()
         except TimeoutError:
             line = b""
         if line != b"ready\n":
@@ -220,7 +221,8 @@ class Rig:
         if process.stdin is not None:
             process.stdin.close()
         try:
-            await asyncio.wait_for(process.wait(), 1.0)
+            async with asyncio.timeout(1.0):
+                await process.wait()
         except TimeoutError:
             process.kill()
             await process.wait()
@@ -372,10 +374,12 @@ class Rig:
             if command.params or command.device:
                 raise ValueError("unplug is a fault of the adapter: it has no device and no parameters")
             self.actuator_bus.unplug()
-        elif command.device is not None:
-            self.actuator_bus.inject(command.name, address=_ADDRESSES[command.device], **command.params)
         else:
-            self.actuator_bus.inject(command.name, **command.params)
+            if "address" in command.params:
+                raise ValueError("name the unit by device, not by address")
+            address = None if command.device is None else _ADDRESSES[command.device]
+            params: dict[str, Any] = dict(command.params)
+            self.actuator_bus.inject(command.name, address=address, **params)
         self._faults["actuators"][command.name] = dict(command.params)
 
     async def _clear_faults(self, part: str | None) -> None:

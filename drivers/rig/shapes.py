@@ -161,8 +161,10 @@ class Solid:
 
 _DARK, _YELLOW, _GREY, _RUBBER = (40, 40, 44), (30, 165, 215), (105, 108, 112), (34, 32, 32)
 MACHINE: tuple[Solid, ...] = (
-    Solid("box", (-0.02, 0.0, 0.45), (0.26, 0.26, 0.035), _DARK),  # the circle that carries the blade
-    Solid("box", (0.32, 0.0, 0.50), (0.36, 0.045, 0.03), _YELLOW, elevation_deg=-10.0),  # drawbar
+    Solid("ellipsoid", (-0.06, 0.0, 0.43), (0.24, 0.24, 0.05), _DARK),  # the circle that carries the blade
+    Solid("box", (0.26, 0.0, 0.535), (0.3, 0.03, 0.025), _YELLOW, elevation_deg=-14.0),  # drawbar
+    Solid("box", (-0.05, 0.22, 0.36), (0.025, 0.02, 0.10), _DARK),  # the circle's arms down to the blade
+    Solid("box", (-0.05, -0.22, 0.36), (0.025, 0.02, 0.10), _DARK),
     Solid("box", (-1.15, 0.0, 0.50), (0.35, 0.30, 0.22), _YELLOW),  # rear body
     Solid("box", (-0.55, 0.0, 0.62), (0.6, 0.07, 0.05), _YELLOW),  # frame
     Solid("ellipsoid", (-0.75, 0.36, 0.17), (0.19, 0.07, 0.19), _RUBBER),  # tandem wheels

@@ -83,8 +83,8 @@ class SoilField:
         if heights_m is not None and heights_m.shape != shape:
             raise ValueError(f"heights have shape {heights_m.shape}, the bed has {shape} cells")
         self.heights_m: FloatArray = np.zeros(shape) if heights_m is None else heights_m.astype(np.float64)
-        self.x_m: FloatArray = (np.arange(shape[0]) + 0.5) * cell_m
-        self.y_m: FloatArray = (np.arange(shape[1]) + 0.5) * cell_m - width_m / 2.0
+        self.x_m: FloatArray = (np.arange(shape[0], dtype=np.float64) + 0.5) * cell_m
+        self.y_m: FloatArray = (np.arange(shape[1], dtype=np.float64) + 0.5) * cell_m - width_m / 2.0
 
     @property
     def volume_m3(self) -> float:

@@ -50,8 +50,10 @@ class Rays:
         dx, dy, dz = (np.ascontiguousarray(r[row, 0] * u + r[row, 1] * v + r[row, 2]) for row in range(3))
         horizontal = np.asarray(cv2.magnitude(dx, dy), np.float32)
         azimuth = np.asarray(cv2.phase(-dx, dy), np.float32)
-        azimuth = np.where(azimuth > np.pi, azimuth - np.float32(2 * np.pi), azimuth)
-        return cls(pose.position_m, dx, dy, dz, horizontal, dz / np.maximum(horizontal, 1e-6), azimuth)
+        azimuth = np.where(azimuth > np.pi, azimuth - np.float32(2 * np.pi), azimuth).astype(np.float32)
+        return cls(
+            pose.position_m, dx, dy, dz, horizontal, np.asarray(dz / np.maximum(horizontal, 1e-6), np.float32), azimuth
+        )
 
 
 def _row_of(slope: Image32) -> Image32:
