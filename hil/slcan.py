@@ -1,8 +1,8 @@
 """An emulated slcan USB adapter under the kernel's own slcan driver.
 
-``Adapter`` holds a pseudo-terminal; its slave end gets the slcan line discipline, so the kernel makes a CAN interface of
-it with bit rate, states and error counters. What the interface sends goes to a vcan that plays the wire, and back. The
-adapter can report what a real one would: no acknowledgement, error-passive, bus-off. Closing it is pulling the plug.
+``Adapter`` holds a pseudo-terminal; its slave end gets the slcan line discipline, so the kernel makes a CAN interface
+of it with bit rate, states and error counters. What the interface sends goes to a vcan that plays the wire, and back.
+It can report what a real adapter would: no acknowledgement, error-passive, bus-off. Closing it is pulling the plug.
 
 The adapter's lines are those of Lawicel's CAN232 manual (``T`` and ``t`` frames, ``S``, ``O``, ``C``); ``s…`` and
 ``e…`` are the state and error reports that Linux 6.0 and later understand (drivers/net/can/slcan/slcan-core.c).
@@ -117,10 +117,7 @@ class Adapter:
 
     def _from_wire(self, frame: bytes) -> None:
         can_id, length, data = FRAME.unpack(frame)
-        if can_id & EXTENDED:
-            head = f"T{can_id & 0x1FFFFFFF:08X}"
-        else:
-            head = f"t{can_id & 0x7FF:03X}"
+        head = f"T{can_id & 0x1FFFFFFF:08X}" if can_id & EXTENDED else f"t{can_id & 0x7FF:03X}"
         with self._lock:
             if not self._off:
                 os.write(self._master, f"{head}{length}{data[:length].hex().upper()}\r".encode("ascii"))

@@ -99,9 +99,14 @@ def pip(*arguments: str | Path) -> None:
 
 
 def our_wheel(package: Package, scratch: Path) -> Path:
-    """The project's own wheel, built from the files git knows (a build in place would pick up leftovers)."""
+    """The project's own wheel, built from the files git does not ignore (a build in place picks up leftovers)."""
     source = scratch / "source"
-    listed = subprocess.run(["git", "ls-files", "-z"], cwd=PROJECT, capture_output=True, check=True).stdout
+    listed = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"],
+        cwd=PROJECT,
+        capture_output=True,
+        check=True,
+    ).stdout
     for name in listed.decode().split("\0"):
         if name and (PROJECT / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,299 @@
+"""The installed service as a user meets it: systemctl, CLI, HTTP on the socket; and the rig in a unit of its own."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import tomlkit
+
+SOCKET: Final = Path("/run/graderd/graderd.sock")
+CONFIG: Final = Path("/etc/graderd/graderd.toml")
+RIG_DIRECTORY: Final = Path("/run/hil-rig")
+PYTHON: Final = "/opt/graderd/bin/python"
+Status = dict[str, Any]
+
+
+class WaitError(AssertionError):
+    """Something did not come true in time; the text says what was seen last."""
+
+
+def wait_for(what: str, check: Callable[[], Any], timeout_s: float, every_s: float = 0.05) -> Any:
+    """The first true value of ``check``.
+
+    Raises:
+        WaitError: none within ``timeout_s``.
+    """
+    until_s = time.monotonic() + timeout_s
+    while True:
+        value = check()
+        if value:
+            return value
+        if time.monotonic() > until_s:
+            raise WaitError(f"{what}: not within {timeout_s:g} s, last was {value!r}")
+        time.sleep(every_s)
+
+
+def run(*command: str, timeout_s: float = 60.0, check: bool = True) -> subprocess.CompletedProcess[str]:
+    """Run a command.
+
+    Raises:
+        AssertionError: with ``check``, it ended with another status than 0.
+    """
+    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+    assert not check or done.returncode == 0, f"{command}: status {done.returncode}\n{done.stdout}{done.stderr}"
+    return done
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """One systemd unit."""
+
+    name: str
+
+    def ctl(self, verb: str, *, check: bool = True) -> subprocess.CompletedProcess[str]:
+        """``systemctl VERB UNIT``."""
+        return run("systemctl", verb, self.name, check=check)
+
+    def show(self, name: str) -> str:
+        """One property."""
+        return run("systemctl", "show", "--value", "-p", name, self.name).stdout.strip()
+
+    @property
+    def state(self) -> str:
+        """ActiveState: active, inactive, failed, activating, deactivating."""
+        return self.show("ActiveState")
+
+    @property
+    def pid(self) -> int:
+        """Main process, 0 where there is none."""
+        return int(self.show("MainPID"))
+
+    @property
+    def restarts_n(self) -> int:
+        """How often systemd has started it again by itself."""
+        return int(self.show("NRestarts"))
+
+    def kill(self, number: signal.Signals) -> None:
+        """Send a signal to the main process."""
+        os.kill(self.pid, number)
+
+    def journal(self, lines: int = 60) -> str:
+        """The newest lines of its log."""
+        return run("journalctl", "-u", self.name, "-n", str(lines), "--no-pager", "-o", "short-monotonic").stdout
+
+
+class Refused(Exception):  # noqa: N818  (the answer to a request, not a failure of the test)
+    """The daemon answered with an error status; ``args`` are the status and the body."""
+
+
+class Api:
+    """The HTTP interface on the unix socket."""
+
+    def __init__(self, path: Path = SOCKET) -> None:
+        self._path = path
+
+    def request(self, method: str, path: str, body: object = None, timeout_s: float = 10.0) -> Any:
+        """One request; the decoded answer.
+
+        Raises:
+            Refused: the status is 400 or above.
+            OSError: nobody serves the socket.
+        """
+        connection = http.client.HTTPConnection("localhost", timeout=timeout_s)
+        connection.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        connection.sock.settimeout(timeout_s)
+        try:
+            connection.sock.connect(str(self._path))
+            payload = None if body is None else json.dumps(body)
+            connection.request(method, path, payload, {"Content-Type": "application/json"} if payload else {})
+            response = connection.getresponse()
+            answer = json.loads(response.read() or b"null")
+        finally:
+            connection.close()
+        if response.status >= 400:
+            raise Refused(response.status, answer)
+        return answer
+
+    def status(self) -> Status:
+        """Everything at one moment."""
+        found: Status = self.request("GET", "/v1/status")
+        return found
+
+    def command(self, name: str, **arguments: object) -> Any:
+        """One command."""
+        return self.request("POST", "/v1/commands", {"command": name, "client": "hil", **arguments})
+
+    def stop(self) -> Any:
+        """The stop lane."""
+        return self.request("POST", "/v1/stop", {"client": "hil", "reason": "hil"})
+
+
+class Grader:
+    """graderd.service with its interface."""
+
+    def __init__(self) -> None:
+        self.unit = Unit("graderd.service")
+        self.api = Api()
+
+    def configure(self, changes: Mapping[str, object]) -> None:
+        """Set dotted keys in the installed configuration; comments stay."""
+        document = tomlkit.parse(CONFIG.read_text(encoding="utf-8"))
+        for dotted, value in changes.items():
+            *path, key = dotted.split(".")
+            table: Any = document
+            for name in path:
+                table = table.setdefault(name, tomlkit.table())
+            table[key] = value
+        CONFIG.write_text(tomlkit.dumps(document), encoding="utf-8")
+
+    def start(self, timeout_s: float = 60.0) -> Status:
+        """Start (or restart) the service and wait until every axis can be read."""
+        run("systemctl", "reset-failed", self.unit.name, check=False)
+        run("systemctl", "restart", self.unit.name, timeout_s=timeout_s)
+        return self.wait_ready()
+
+    def status_or_none(self) -> Status | None:
+        """The status, or None while nobody answers."""
+        try:
+            return self.api.status()
+        except (OSError, http.client.HTTPException):
+            return None
+
+    def wait(self, what: str, check: Callable[[Status], Any], timeout_s: float = 20.0) -> Status:
+        """The first status for which ``check`` is true.
+
+        Raises:
+            WaitError: none in time; tells mode, faults and axes as seen last.
+        """
+        last: Status | None = None
+        until_s = time.monotonic() + timeout_s
+        while time.monotonic() < until_s:
+            last = self.status_or_none()
+            if last is not None and check(last):
+                return last
+            time.sleep(0.05)
+        raise WaitError(f"{what}: not within {timeout_s:g} s; {brief(last)}\n{self.unit.journal(25)}")
+
+    def wait_ready(self, timeout_s: float = 40.0) -> Status:
+        """Wait until all four axes are in standby and the camera gives pictures."""
+
+        def ready(status: Status) -> bool:
+            axes = status["axes"].values()
+            return len(axes) == 4 and all(a["lifecycle"] == "standby" for a in axes) and seen(status)
+
+        def seen(status: Status) -> bool:
+            return status["soil"]["age_s"] is not None and not mandatory_unmet(status)
+
+        return self.wait("ready to arm", ready, timeout_s)
+
+    def arm(self, mode: str = "manual") -> Status:
+        """Arm and wait until it is done, then go to ``mode``."""
+        self.api.command("arm")
+        self.wait("armed", lambda s: s["mode"] in ("manual", "auto"), 15.0)
+        self.api.command(mode)
+        return self.wait(mode, lambda s: s["mode"] == mode, 5.0)
+
+    def disarm(self) -> None:
+        """Back to disarmed from any mode."""
+        mode = self.api.status()["mode"]
+        if mode == "stopped":
+            self.api.command("reset")
+        elif mode != "disarmed":
+            self.api.command("disarm")
+        self.wait("disarmed", lambda s: s["mode"] == "disarmed", 10.0)
+
+    def cli(self, *arguments: str, check: bool = True, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+        """``graderd ARGUMENTS…``."""
+        return run("graderd", *arguments, check=check, timeout_s=timeout_s)
+
+
+def mandatory_unmet(status: Status) -> list[str]:
+    """Names of the requirements that keep arming away."""
+    return [r["name"] for r in status["readiness"] if r["mandatory"] and not r["met"]]
+
+
+def faults(status: Status) -> set[str]:
+    """Names of the active faults."""
+    return {fault["name"] for fault in status["faults"]}
+
+
+def brief(status: Status | None) -> str:
+    """What matters of a status, for messages."""
+    if status is None:
+        return "nobody answers on the socket"
+    axes = {name: (a["lifecycle"], a["measured"], a["moving"]) for name, a in status["axes"].items()}
+    soil = status["soil"]
+    return (
+        f"mode {status['mode']} ({status['reason']}), faults {sorted(faults(status))}, axes {axes}, "
+        f"soil {soil['zone']} {soil['age_s']} s, unmet {mandatory_unmet(status)}, tick {status['tick']}"
+    )
+
+
+class Rig:
+    """The simulated grader in a transient unit of its own, as the daemon's user; it plays the hardware."""
+
+    def __init__(self, can: str, seed: int = 0) -> None:
+        self.unit = Unit("hil-rig.service")
+        self._can = can
+        self._seed = seed
+
+    def start(self) -> None:
+        """Start it and wait until its wires are there."""
+        run("systemctl", "reset-failed", self.unit.name, check=False)
+        (RIG_DIRECTORY / "rig.json").unlink(missing_ok=True)
+        run(
+            "systemd-run",
+            "--quiet",
+            f"--unit={self.unit.name}",
+            "--uid=graderd",
+            "--gid=graderd",
+            f"--property=RuntimeDirectory={RIG_DIRECTORY.name}",
+            "--property=RuntimeDirectoryPreserve=yes",
+            # It plays hardware, which does not wait for the processor.
+            "--property=CPUWeight=10000",
+            "--property=Nice=-5",
+            # At shutdown the hardware is still there when the service ends.
+            "--property=Before=graderd.service",
+            *(PYTHON, "-I", "-m", "drivers.rig", f"--dir={RIG_DIRECTORY}", f"--can=socketcan:{self._can}"),
+            f"--seed={self._seed}",
+        )
+        wait_for("rig.json", (RIG_DIRECTORY / "rig.json").exists, 40.0)
+
+    def stop(self) -> None:
+        """End it."""
+        self.unit.ctl("stop", check=False)
+
+    def ask(self, command: str, **arguments: object) -> dict[str, Any]:
+        """One request on its control socket.
+
+        Raises:
+            AssertionError: it refused.
+        """
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+            connection.settimeout(20.0)
+            connection.connect(str(RIG_DIRECTORY / "control.sock"))
+            connection.sendall(json.dumps({"cmd": command, **arguments}).encode() + b"\n")
+            with connection.makefile("rb") as lines:
+                answer: dict[str, Any] = json.loads(lines.readline())
+        assert "error" not in answer, answer
+        return answer
+
+    def configuration(self) -> dict[str, object]:
+        """What the daemon's configuration says to meet this rig."""
+        return {
+            "rotation.port": str(RIG_DIRECTORY / "servo"),
+            "can.interface": "socketcan",
+            "can.channel": self._can,
+            "camera.source": "rig",
+            "camera.path": str(RIG_DIRECTORY / "camera.sock"),
+        }
