@@ -1,0 +1,110 @@
+"""Litres per third from depth pictures whose truth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graderd.core.zones import Zone
+from graderd.hal.camera import DepthImage
+from graderd.perception import CameraCalibration, PerceptionSettings
+from graderd.perception.depth import DepthJudge, HeightMap, fill_hidden
+from graderd.perception.geometry import LEFT, RIGHT, View
+from tests.perception_scenes import PoseError, Scene, height_field, render, volumes_l
+
+SETTINGS = PerceptionSettings()
+CALIBRATION = CameraCalibration()
+ERRORS = [
+    PoseError(),
+    PoseError(z_m=0.02, pitch_deg=2.0),
+    PoseError(z_m=-0.02, pitch_deg=-2.0),
+    PoseError(0.02, -0.02, 0.02, -2.0, 2.0, -2.0),
+    PoseError(-0.02, 0.02, -0.02, 2.0, -2.0, 2.0),
+]
+
+
+def judge_of(scene: Scene, spoil: float = 0.0) -> tuple[DepthJudge, DepthImage]:
+    frame = render(scene, color_size=(32, 20))
+    assert frame.depth_mm is not None
+    assert frame.depth_intrinsics is not None
+    depth = frame.depth_mm
+    if spoil:
+        depth[np.random.default_rng(scene.seed).random(depth.shape) < spoil] = 0
+    view = View(frame.depth_intrinsics, CALIBRATION.depth.pose(CALIBRATION.mounting))
+    return DepthJudge(view, scene.blade, SETTINGS.depth, SETTINGS.decision), depth
+
+
+def measure(scene: Scene, spoil: float = 0.0) -> tuple[Zone, HeightMap]:
+    judge, depth = judge_of(scene, spoil)
+    soil = judge.height_map(depth, scene.angle_deg)
+    return judge.verdict(soil).zone, soil
+
+
+@pytest.mark.parametrize("error", ERRORS)
+@pytest.mark.parametrize("zone", [Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN, Zone.NONE])
+def test_zone_and_litres_in_spite_of_pose_errors(zone: Zone, error: PoseError) -> None:
+    scene = Scene(zone=zone, angle_deg=(15.0 if zone is Zone.CENTER else -20.0), seed=3, pose=error)
+    found, soil = measure(scene)
+    assert found is zone
+    left, center, right = volumes_l(scene, height_field(scene))
+    for measured, true in zip(soil.volumes_l, (right, center, left), strict=True):
+        assert measured == pytest.approx(true, abs=1.2 + 0.15 * true)
+
+
+@pytest.mark.parametrize("angle", [-55, -30, 30, 55])
+@pytest.mark.parametrize("zone", [Zone.LEFT, Zone.RIGHT])
+def test_sides_over_the_whole_range_of_angles(zone: Zone, angle: float) -> None:
+    assert measure(Scene(zone=zone, angle_deg=angle, seed=5))[0] is zone
+
+
+def test_ground_of_a_displaced_camera_is_found() -> None:
+    soil = measure(Scene(pose=PoseError(z_m=0.02, pitch_deg=1.5)))[1]
+    # A camera that is higher and looks further down than calibrated puts level ground where this plane says.
+    assert soil.ground.support > 0.9
+    assert 1.2 < soil.ground.slope_deg() < 1.8
+    assert soil.ground.residual_m < 0.005
+
+
+def test_blade_is_found_where_it_really_is() -> None:
+    soil = measure(Scene(angle_deg=20, pose=PoseError(y_m=0.02)))[1]
+    assert soil.blade.ahead_m == pytest.approx(-0.02 * np.sin(np.radians(20)), abs=0.006)
+    assert soil.blade.along_m == pytest.approx(-0.02 * np.cos(np.radians(20)), abs=0.010)
+
+
+def test_half_of_the_pixels_missing_changes_nothing() -> None:
+    assert measure(Scene(zone=Zone.LEFT, seed=1), spoil=0.5)[0] is Zone.LEFT
+    assert measure(Scene(zone=Zone.NONE, seed=1), spoil=0.5)[0] is Zone.NONE
+
+
+def test_too_little_depth_on_one_third_is_unknown() -> None:
+    judge, depth = judge_of(Scene(zone=Zone.LEFT, seed=1))
+    depth[:, : depth.shape[1] // 2] = 0  # the machine's right
+    verdict = judge.verdict(judge.height_map(depth, 0.0))
+    assert verdict.zone is Zone.UNKNOWN
+    assert "has depth" in verdict.reason
+
+
+def test_an_empty_picture_is_unknown() -> None:
+    judge, depth = judge_of(Scene())
+    assert judge.verdict(judge.height_map(np.zeros_like(depth), 0.0)).zone is Zone.UNKNOWN
+
+
+def test_more_noise_invents_no_soil() -> None:
+    assert measure(Scene(noise_px=0.3, seed=2))[0] is Zone.NONE
+
+
+def test_mirrored_soil_gives_mirrored_litres() -> None:
+    left = measure(Scene(zone=Zone.LEFT, seed=4, holes=0.0, noise_px=0.0))[1]
+    assert left.volumes_l[LEFT] > 10 * max(left.volumes_l[RIGHT], 0.1)
+
+
+def test_same_picture_same_answer() -> None:
+    judge, depth = judge_of(Scene(zone=Zone.CENTER, seed=9))
+    assert judge.height_map(depth, 10.0).volumes_l == judge.height_map(depth, 10.0).volumes_l
+
+
+def test_hidden_cells_fall_from_the_crest() -> None:
+    height = np.array([[0.0, 0.0, 0.0, 0.10, 0.05]])
+    seen = np.array([[False, False, False, True, True]])
+    filled = fill_hidden(height, seen, 0.03)
+    assert filled[0] == pytest.approx([0.01, 0.04, 0.07, 0.10, 0.05])
