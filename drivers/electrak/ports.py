@@ -255,11 +255,19 @@ class QuietSlcanBus(slcanBus):
         except OSError as error:
             raise can.CanOperationError(f"cannot read: {error.strerror}", error.errno) from error
         if not data:
-            raise can.CanOperationError("the adapter hung up", errno.ENODEV)
+            # With VMIN 0 a terminal without input reads as empty too: only the hang-up flag tells them apart.
+            if self._hung_up():
+                raise can.CanOperationError("the adapter hung up", errno.ENODEV)
+            return
         self._buffer += data.replace(b"\a", b"\a\r")
         *lines, rest = self._buffer.split(b"\r")
         self._buffer = bytearray(rest[-128:])
         self._lines.extend(line.decode("ascii", "replace") + "\r" for line in lines if line and line != b"\a")
+
+    def _hung_up(self) -> bool:
+        poller = select.poll()
+        poller.register(self.serialPortOrig.fileno(), select.POLLIN)
+        return any(flags & (select.POLLHUP | select.POLLERR | select.POLLNVAL) for _, flags in poller.poll(0))
 
     def _note_state(self, line: str) -> None:
         event = {
