@@ -1,0 +1,297 @@
+"""Two lifts as one axis pair: both sides stay together on the straight line from where they are to their targets.
+
+Each lift reports its position only every 105 ms, one may be much slower than the other (load, wear, supply), and the
+motors know speed only as a share of full speed. The coordinator learns how fast each side is for a given share, gives
+the pair the pace of the slower one, and corrects the rest by how far each side is ahead or behind. A side that is lost
+or does not move stops the other.
+
+Pure: no clock, no device; :meth:`LiftPair.step` is called every control tick with the newest readings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from pydantic import Field
+
+from graderd.hal.settings import Positive, Settings
+
+SIDES: Final = ("lift_left", "lift_right")
+
+
+class LiftPairSettings(Settings):
+    """How closely the sides are kept together."""
+
+    full_speed_mm_per_s: Positive = Field(50.0, description="guess of a lift's speed at speed share 1, until learned")
+    first_share: Positive = Field(0.36, le=1.0, description="speed share while a side's speed is still unknown")
+    min_share: Positive = Field(0.32, le=1.0, description="slowest speed share at which a lift moves well")
+    catch_up_hz: Positive = Field(3.0, description="how much slower the side ahead goes, mm/s for each mm")
+    wait_mm: Positive = Field(2.7, description="the side ahead stops from here on until the other has come up")
+    level_mm: Positive = Field(0.8, description="the other has come up when it is this close")
+    apart_mm: Positive = Field(3.0, description="further apart than this is a fault")
+    stop_apart_mm: Positive = Field(6.0, description="further apart than this stops both")
+    stuck_s: Positive = Field(0.9, description="a commanded side that does not move for so long is stuck")
+    reading_max_age_s: Positive = Field(0.35, description="an older position counts as lost")
+
+
+@dataclass(frozen=True, slots=True)
+class SideReading:
+    """Measured extension of one lift and the monotonic time it was measured at."""
+
+    position_mm: float
+    time_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SideCommand:
+    """What one lift shall do now: go to ``target_mm`` at ``speed_share`` (0 exclusive to 1), or hold (None)."""
+
+    target_mm: float | None
+    speed_share: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class PairCommand:
+    """Commands for both sides; ``apart_mm`` is how far they are from being level with each other on their way.
+
+    ``condition`` is ``sides_apart`` or empty; ``stopped`` says why both hold until the pair is released, or is empty.
+    """
+
+    left: SideCommand
+    right: SideCommand
+    apart_mm: float = 0.0
+    condition: str = ""
+    stopped: str = ""
+
+
+_HOLD_BOTH: Final = PairCommand(SideCommand(None), SideCommand(None))
+_SHARE_LAG_S: Final = 0.15
+"""From a speed share to the speed it gives: control period and soft start."""
+_MIN_DRIVE_S: Final = 0.01
+_KNOWN_DRIVE_S: Final = 0.05
+_KNOWN_MM: Final = 1.5
+"""A gain counts as known after this much movement."""
+_FORGET: Final = 0.85
+_NEAR_MM: Final = 8.0
+"""Lifts slow down by themselves this close to their target: nothing is learned there."""
+_TAPER: Final = 0.5
+_AHEAD_N: Final = 3
+"""A side is held back when it is too far ahead in so many steps; a single estimate is too noisy for that."""
+_STILL_MM_PER_S: Final = 2.0
+_MOVED_MM: Final = 0.5
+_NEW_TARGET_MM: Final = 0.05
+
+
+@dataclass(slots=True)
+class _Side:
+    """One lift: its way, its newest reading, and how fast it is for a speed share.
+
+    ``drive_s`` is the time integral of the share that acts (the commanded one, lagging); a side's gain is millimetres
+    for one second of it. Position between two readings is the last one plus gain times the drive since.
+    """
+
+    start_mm: float = 0.0
+    target_mm: float = 0.0
+    position_mm: float = 0.0
+    velocity_mm_per_s: float = 0.0
+    reading: SideReading | None = None
+    reading_drive_s: float = 0.0
+    share: float = 0.0
+    acting_share: float = 0.0
+    drive_s: float = 0.0
+    learned: dict[int, tuple[float, float]] = field(default_factory=dict)
+    moved_at_s: float = 0.0
+    moved_from_mm: float = 0.0
+
+    @property
+    def way_mm(self) -> float:
+        return self.target_mm - self.start_mm
+
+    @property
+    def direction(self) -> int:
+        return 1 if self.target_mm >= self.position_mm else -1
+
+    @property
+    def gain_mm_per_s(self) -> float | None:
+        """Speed at share 1 in the present direction; None until learned."""
+        moved_mm, drive_s = self.learned.get(self.direction, (0.0, 0.0))
+        return moved_mm / drive_s if drive_s > _KNOWN_DRIVE_S and moved_mm > _KNOWN_MM else None
+
+    def drive(self, elapsed_s: float) -> None:
+        """Let time pass."""
+        self.acting_share += (self.share - self.acting_share) * min(1.0, elapsed_s / _SHARE_LAG_S)
+        self.drive_s += self.acting_share * elapsed_s
+
+    def see(self, reading: SideReading, now_s: float, *, learn: bool) -> None:
+        """Take the newest reading (which may be the one of before)."""
+        last = self.reading
+        if last is None or reading.time_s > last.time_s:
+            drive_s = self.drive_s - self.acting_share * max(0.0, now_s - reading.time_s)
+            if last is not None:
+                moved_mm = reading.position_mm - last.position_mm
+                self.velocity_mm_per_s = moved_mm / (reading.time_s - last.time_s)
+                if learn:
+                    self._learn(moved_mm * self.direction, drive_s - self.reading_drive_s)
+            self.reading, self.reading_drive_s = reading, drive_s
+        gain = self.gain_mm_per_s
+        coming_mm = gain * (self.drive_s - self.reading_drive_s) if gain else 0.0
+        remaining_mm = abs(self.target_mm - reading.position_mm)
+        if remaining_mm < _NEAR_MM:  # it slows down and stops by itself
+            coming_mm = min(coming_mm * _TAPER, remaining_mm) if abs(self.velocity_mm_per_s) > _STILL_MM_PER_S else 0.0
+        self.position_mm = reading.position_mm + self.direction * coming_mm
+
+    def _learn(self, moved_mm: float, drive_s: float) -> None:
+        if drive_s < _MIN_DRIVE_S or abs(self.target_mm - self.position_mm) < _NEAR_MM or moved_mm < 0.0:
+            return
+        old_mm, old_s = self.learned.get(self.direction, (0.0, 0.0))
+        self.learned[self.direction] = (_FORGET * old_mm + moved_mm, _FORGET * old_s + drive_s)
+
+
+class LiftPair:
+    """Coordinator of one pair. One object for one pair; its memory is what it learned and the move in progress."""
+
+    def __init__(self, settings: LiftPairSettings | None = None) -> None:
+        self._settings = settings or LiftPairSettings()
+        self._sides = (_Side(), _Side())
+        self._moving = False
+        self._waiting: int | None = None
+        self._ahead_n = 0
+        self._stopped = ""
+        self._last_s: float | None = None
+        self._apart_mm = 0.0
+
+    def release(self) -> None:
+        """The pair is commanded no more: forget the move and why it was stopped, keep what was learned."""
+        self._moving = False
+        self._waiting = None
+        self._stopped = ""
+        self._last_s = None
+        for side in self._sides:
+            side.share = side.acting_share = 0.0
+            side.reading = None
+            side.velocity_mm_per_s = 0.0
+
+    def step(
+        self,
+        now_s: float,
+        left: SideReading | None,
+        right: SideReading | None,
+        left_target_mm: float,
+        right_target_mm: float,
+    ) -> PairCommand:
+        """Commands for this tick. ``left`` and ``right`` are the newest readings, None where there is none."""
+        if self._stopped:
+            return self._stop(self._stopped)
+        for name, reading in zip(SIDES, (left, right), strict=True):
+            if reading is None or now_s - reading.time_s > self._settings.reading_max_age_s:
+                return self._stop(f"{name} is not measured")
+        assert left is not None  # for the type checker; the loop above returned otherwise
+        assert right is not None
+        elapsed_s = 0.0 if self._last_s is None else min(max(0.0, now_s - self._last_s), 0.2)
+        self._last_s = now_s
+        for side, reading in zip(self._sides, (left, right), strict=True):
+            side.drive(elapsed_s)
+            side.see(reading, now_s, learn=self._moving and self._waiting is None)
+        self._aim((left_target_mm, right_target_mm), now_s)
+        stuck = self._stuck(now_s)
+        if stuck:
+            return self._stop(stuck)
+        deviations_mm = self._deviations_mm()
+        self._apart_mm = abs(deviations_mm[0] - deviations_mm[1])
+        if self._apart_mm > self._settings.stop_apart_mm:
+            return self._stop(f"the sides are {self._apart_mm:.1f} mm apart")
+        self._wait(deviations_mm)
+        commands = self._share(deviations_mm) if self._waiting is None else self._catch_up(self._waiting)
+        condition = "sides_apart" if self._apart_mm > self._settings.apart_mm else ""
+        return PairCommand(*commands, self._apart_mm, condition)
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _stop(self, reason: str) -> PairCommand:
+        self._stopped = reason
+        self._moving = False
+        condition = "sides_apart" if self._apart_mm > self._settings.apart_mm else ""
+        return PairCommand(_HOLD_BOTH.left, _HOLD_BOTH.right, self._apart_mm, condition, reason)
+
+    def _aim(self, targets_mm: tuple[float, float], now_s: float) -> None:
+        """Begin a move, or bend the one in progress: the line then goes on from where the pair should be now."""
+        if not self._moving:
+            for side in self._sides:
+                side.start_mm = side.position_mm
+                side.moved_at_s, side.moved_from_mm = now_s, side.position_mm
+        elif all(abs(s.target_mm - t) < _NEW_TARGET_MM for s, t in zip(self._sides, targets_mm, strict=True)):
+            return
+        else:
+            deviations_mm = self._deviations_mm()
+            for side, deviation_mm in zip(self._sides, deviations_mm, strict=True):
+                side.start_mm = side.position_mm - deviation_mm
+        self._moving = True
+        for side, target_mm in zip(self._sides, targets_mm, strict=True):
+            side.target_mm = target_mm
+
+    def _deviations_mm(self) -> tuple[float, float]:
+        """How far each side is off the line, in mm of extension; opposite signs where one is ahead of the other."""
+        left, right = self._sides
+        square = left.way_mm**2 + right.way_mm**2
+        progress = 1.0
+        if square > 0.01:
+            done = left.way_mm * (left.position_mm - left.start_mm) + right.way_mm * (
+                right.position_mm - right.start_mm
+            )
+            progress = min(max(done / square, 0.0), 1.0)
+        return (
+            left.position_mm - left.start_mm - progress * left.way_mm,
+            right.position_mm - right.start_mm - progress * right.way_mm,
+        )
+
+    def _stuck(self, now_s: float) -> str:
+        for name, side in zip(SIDES, self._sides, strict=True):
+            remaining_mm = abs(side.target_mm - side.position_mm)
+            moved = abs(side.position_mm - side.moved_from_mm) > _MOVED_MM
+            if moved or side.share == 0.0 or remaining_mm < 3.0:
+                side.moved_at_s, side.moved_from_mm = now_s, side.position_mm
+            elif now_s - side.moved_at_s > self._settings.stuck_s:
+                return f"{name} does not move, {remaining_mm:.1f} mm before its target"
+        return ""
+
+    def _wait(self, deviations_mm: tuple[float, float]) -> None:
+        """Begin or end the waiting of a side that is too far ahead."""
+        settings = self._settings
+        if self._waiting is None:
+            ahead_mm = [2.0 * d * (1 if s.way_mm >= 0 else -1) for s, d in zip(self._sides, deviations_mm, strict=True)]
+            index = 0 if ahead_mm[0] > ahead_mm[1] else 1
+            far = ahead_mm[index] > settings.wait_mm and abs(self._sides[index].way_mm) > _MOVED_MM
+            self._ahead_n = self._ahead_n + 1 if far else 0
+            if self._ahead_n >= _AHEAD_N:
+                self._waiting = index
+        elif self._apart_mm < settings.level_mm and abs(self._sides[1 - self._waiting].velocity_mm_per_s) < 2.0:
+            self._waiting = None
+
+    def _catch_up(self, waiting: int) -> tuple[SideCommand, SideCommand]:
+        """One side holds; the other goes slowly to the same point of the way and rests there, then both start anew."""
+        ahead, behind = self._sides[waiting], self._sides[1 - waiting]
+        ahead.share = ahead.acting_share = 0.0
+        behind.share = self._settings.min_share
+        progress = (ahead.position_mm - ahead.start_mm) / ahead.way_mm
+        command = SideCommand(behind.start_mm + progress * behind.way_mm, behind.share)
+        return (SideCommand(None), command) if waiting == 0 else (command, SideCommand(None))
+
+    def _share(self, deviations_mm: tuple[float, float]) -> tuple[SideCommand, SideCommand]:
+        """Speed shares that give both sides the pace of the slower one; the side ahead goes a little slower still."""
+        settings = self._settings
+        longest_mm = max(abs(side.way_mm) for side in self._sides)
+        moving = [side for side in self._sides if abs(side.way_mm) > _MOVED_MM]
+        unknown = len(moving) > 1 and any(side.gain_mm_per_s is None for side in moving)
+        gains = [side.gain_mm_per_s or settings.full_speed_mm_per_s for side in self._sides]
+        pace_mm_per_s = min(
+            (g * longest_mm / abs(s.way_mm) for g, s in zip(gains, self._sides, strict=True) if s in moving),
+            default=settings.full_speed_mm_per_s,
+        )
+        for side, gain, deviation_mm in zip(self._sides, gains, deviations_mm, strict=True):
+            ahead_mm = max(0.0, 2.0 * deviation_mm * (1 if side.way_mm >= 0 else -1))
+            own_mm_per_s = pace_mm_per_s * (abs(side.way_mm) / longest_mm if longest_mm else 1.0)
+            share = (own_mm_per_s - settings.catch_up_hz * ahead_mm) / gain
+            side.share = min(max(share, settings.min_share), settings.first_share if unknown else 1.0)
+        left, right = self._sides
+        return SideCommand(left.target_mm, left.share), SideCommand(right.target_mm, right.share)
