@@ -230,7 +230,7 @@ class CameraProcess:
             if knock is not None:
                 shift = knock["x_m"], knock["y_m"], knock["z_m"]
                 turn = knock["turn_x_deg"], knock["turn_y_deg"], knock["turn_z_deg"]
-                color_pose, depth_pose = knocked(COLOR_POSE, shift, turn), knocked(DEPTH_POSE, shift, turn)
+                color_pose, depth_pose = knocked(shift, turn)
             while len(self._renderers) >= 3:
                 self._renderers.pop(next(iter(self._renderers)))
             self._renderers[key] = Renderer(

@@ -41,7 +41,7 @@ def heap(
     along = (field.x_m - x_m)[:, None] / (length_m / 2.0)
     across = (field.y_m - y_m)[None, :] / (width_m / 2.0)
     dome = np.clip(1.0 - np.abs(along) ** 3 - np.abs(across) ** 2, 0.0, None) ** 0.5
-    return np.asarray(height_m * dome * _lumps(field, seed))
+    return np.asarray(height_m * dome * lumps(field, seed))
 
 
 def layer(
@@ -49,7 +49,7 @@ def layer(
 ) -> FloatArray:
     """An even layer between two places along the bed, ``half_width_m`` to either side of its middle line."""
     inside = ((field.x_m >= x_min_m) & (field.x_m <= x_max_m))[:, None] & (np.abs(field.y_m) <= half_width_m)[None, :]
-    return np.asarray(inside * height_m * _lumps(field, seed, depth=0.12))
+    return np.asarray(inside * height_m * lumps(field, seed, depth=0.12))
 
 
 def lay_scene(field: SoilField, zone: SceneZone, x_m: float, pose: BladePose, seed: int = 0) -> None:
@@ -73,7 +73,7 @@ def lay_scene(field: SoilField, zone: SceneZone, x_m: float, pose: BladePose, se
     field.heights_m[(d_m < 0.02) & (np.abs(s_m) < LENGTH_M / 2.0 + 0.3)] = 0.0
 
 
-def _lumps(field: SoilField, seed: int, depth: float = 0.2) -> FloatArray:
+def lumps(field: SoilField, seed: int, depth: float = 0.2) -> FloatArray:
     """Smooth random factors about 1 (within ``depth``), a hand's breadth wide: no two heaps are alike."""
     rng = np.random.default_rng(seed)
     n_x, n_y = field.heights_m.shape
