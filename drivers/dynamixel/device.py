@@ -14,6 +14,8 @@ EXTENDED_MODE, POSITION_MODE = 4, 3
 WATCHDOG_TRIPPED = -1
 WATCHDOG_STEP_S = 0.020
 _RUN_BYTES = 64
+PATIENT_N = 8
+"""Attempts of a request on which a whole procedure depends (opening, arming); polling has the next poll instead."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,21 +57,25 @@ class Ph54Device:
     async def read(self, name: str) -> int:
         """Value of one register in counts."""
         register = self.table[name]
-        return register.decode((await self.bus.read(self.servo_id, register.address, register.size)).data)
+        packet = await self.bus.read(self.servo_id, register.address, register.size, attempts_n=PATIENT_N)
+        return register.decode(packet.data)
 
-    async def read_block(self, block: Block, *, attempts_n: int = 2) -> tuple[dict[str, int], bool]:
+    async def read_block(self, block: Block, *, attempts_n: int = PATIENT_N) -> tuple[dict[str, int], bool]:
         """Values of neighbouring registers, and whether the servo's alert bit is set."""
         packet = await self.bus.read(self.servo_id, block.address, block.size, attempts_n=attempts_n)
         return block.decode(packet.data), packet.alert
 
-    async def write(self, name: str, value: int, *, urgent: bool = False) -> None:
+    async def write(self, name: str, value: int, *, attempts_n: int = PATIENT_N, urgent: bool = False) -> None:
         """Write one register."""
-        register = self.table[name]
-        await self.bus.write(self.servo_id, register.address, register.encode(value), urgent=urgent)
+        register, data = self.table[name], self.table[name].encode(value)
+        await self.bus.write(self.servo_id, register.address, data, attempts_n=attempts_n, urgent=urgent)
 
-    async def write_block(self, block: Block, values: Mapping[str, int], *, urgent: bool = False) -> None:
+    async def write_block(
+        self, block: Block, values: Mapping[str, int], *, attempts_n: int = PATIENT_N, urgent: bool = False
+    ) -> None:
         """Write neighbouring registers in one packet: all of them take effect, or none."""
-        await self.bus.write(self.servo_id, block.address, block.encode(dict(values)), urgent=urgent)
+        data = block.encode(dict(values))
+        await self.bus.write(self.servo_id, block.address, data, attempts_n=attempts_n, urgent=urgent)
 
     async def confirm(self, values: Mapping[str, int], block: Block) -> None:
         """Read a block back and compare.
@@ -103,7 +109,7 @@ class Ph54Device:
         """
         bus, table = self.bus, self.table
         try:
-            model, firmware = await bus.ping(self.servo_id, attempts_n=3)
+            model, firmware = await bus.ping(self.servo_id, attempts_n=6)
         except DeviceTimeoutError as e:
             raise DeviceTimeoutError(
                 self.where,
@@ -139,7 +145,7 @@ class Ph54Device:
         Raises:
             DeviceTimeoutError, DeviceLostError: the servo stopped answering.
         """
-        model, firmware = await self.bus.ping(self.servo_id)
+        model, firmware = await self.bus.ping(self.servo_id, attempts_n=PATIENT_N)
         found: list[Difference] = []
         values: dict[str, int] = {"model_number": model}
         for run in _runs(self.table.registers):

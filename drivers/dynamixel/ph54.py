@@ -21,7 +21,7 @@ from drivers.dynamixel.bus import BusLog, ServoBus, ServoRefusedError
 from drivers.dynamixel.calibration import Calibration
 from drivers.dynamixel.codec import StatusError
 from drivers.dynamixel.detectors import MotionDetectors, Sample
-from drivers.dynamixel.device import EXTENDED_MODE, POSITION_MODE, WATCHDOG_TRIPPED, Difference, Ph54Device
+from drivers.dynamixel.device import EXTENDED_MODE, PATIENT_N, POSITION_MODE, WATCHDOG_TRIPPED, Difference, Ph54Device
 from drivers.dynamixel.faultbook import FaultBook
 from drivers.dynamixel.ports import ListPorts, find_port, system_ports
 from drivers.dynamixel.table import ControlTable
@@ -327,8 +327,8 @@ class Ph54Rotator:
         self._detectors.restart()
         self._corrupt_s.clear()
         goals, _ = await device.read_block(device.goal_block)
-        await self._read_health(device)
-        await self._read_telemetry(device)
+        await self._read_health(device, attempts_n=PATIENT_N)
+        await self._read_telemetry(device, attempts_n=PATIENT_N)
         now_s = self._clock.now_s()
         if goals["bus_watchdog"] == WATCHDOG_TRIPPED:
             self._faults.event("watchdog_tripped", "the servo's bus watchdog had stopped it", now_s)
@@ -447,8 +447,8 @@ class Ph54Rotator:
                     e.where, f"no valid status packet for {silent_s:.2f} s ({seen})", e.remedy
                 ) from e
 
-    async def _read_telemetry(self, device: Ph54Device) -> None:
-        values, alert = await device.read_block(device.telemetry_block, attempts_n=1)
+    async def _read_telemetry(self, device: Ph54Device, *, attempts_n: int = 1) -> None:
+        values, alert = await device.read_block(device.telemetry_block, attempts_n=attempts_n)
         now_s = self._clock.now_s()
         cal = self.calibration
         was_active = self._lifecycle is Lifecycle.ACTIVE
@@ -506,10 +506,10 @@ class Ph54Rotator:
             return (counts + turn // 2) % turn - turn // 2
         return counts
 
-    async def _read_health(self, device: Ph54Device) -> None:
+    async def _read_health(self, device: Ph54Device, *, attempts_n: int = 1) -> None:
         """Torque and hardware error; torque found off ends ACTIVE."""
         self._health_s = now_s = self._clock.now_s()
-        health, _ = await device.read_block(device.health_block)
+        health, _ = await device.read_block(device.health_block, attempts_n=attempts_n)
         bits = health["hardware_error_status"]
         present = {
             name: f"hardware error bit 0x{bit:02X} is set (status 0x{bits:02X}); cleared by a reboot of the servo only"
@@ -522,16 +522,16 @@ class Ph54Rotator:
             self._lifecycle = Lifecycle.STANDBY
             self._goal_deg, self._hold_wanted = None, False
             if not bits:
-                goals, _ = await device.read_block(device.goal_block)
+                self._faults.event("torque_off", "torque was found switched off", now_s)
+                goals, _ = await device.read_block(device.goal_block, attempts_n=2)
                 if goals["bus_watchdog"] == 0:
+                    self._faults.clear("torque_off")
                     self._faults.event("ram_reset", "the servo's RAM registers were reset: its power was cut", now_s)
-                else:
-                    self._faults.event("torque_off", "torque was found switched off", now_s)
 
     async def _check_goals(self, device: Ph54Device) -> None:
         """Whether watchdog and profile still stand as they were written."""
         self._goals_s = now_s = self._clock.now_s()
-        goals, _ = await device.read_block(device.goal_block)
+        goals, _ = await device.read_block(device.goal_block, attempts_n=1)
         if goals["bus_watchdog"] == WATCHDOG_TRIPPED:
             self._faults.event("watchdog_tripped", "the servo's bus watchdog has stopped it; arm again", now_s)
             if self._lifecycle is Lifecycle.ACTIVE:
@@ -587,7 +587,7 @@ class Ph54Rotator:
         low, high = self.calibration.servo_limits()
         counts = max(low, min(high, self.calibration.counts(angle.value)))  # beyond them the servo would refuse
         profile = arming.profile_counts(self.settings, self.calibration, arming.HOLD_ACCELERATION_FACTOR)
-        await device.write_block(device.profile_block, {**profile, "goal_position": counts}, urgent=True)
+        await device.write_block(device.profile_block, {**profile, "goal_position": counts}, attempts_n=2, urgent=True)
         self._hold_profile = True
         self._hold_wanted = False
         self._note_sent(counts)
@@ -595,10 +595,10 @@ class Ph54Rotator:
     async def _send_goal(self, device: Ph54Device, counts: int) -> None:
         if self._hold_profile:
             profile = arming.profile_counts(self.settings, self.calibration)
-            await device.write_block(device.profile_block, {**profile, "goal_position": counts})
+            await device.write_block(device.profile_block, {**profile, "goal_position": counts}, attempts_n=2)
             self._hold_profile = False
         elif counts != self._sent_counts:
-            await device.write("goal_position", counts)
+            await device.write("goal_position", counts, attempts_n=2)
         else:
             return
         self._note_sent(counts)

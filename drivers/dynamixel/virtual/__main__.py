@@ -1,4 +1,7 @@
-"""``python -m drivers.dynamixel.virtual``: virtual servos on a pty for any Dynamixel software, until Ctrl-C."""
+"""``python -m drivers.dynamixel.virtual``: virtual servos on a pty for any Dynamixel software, until Ctrl-C.
+
+Lines on standard input make things go wrong while it runs; ``help`` lists them.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,8 @@ import sys
 from pathlib import Path
 
 from drivers.dynamixel.virtual.bus import VirtualServoBus
-from drivers.dynamixel.virtual.faults import FAULTS
+from drivers.dynamixel.virtual.console import Console
+from drivers.dynamixel.virtual.faults import FAULTS, parse
 from drivers.dynamixel.virtual.servo import VirtualServo
 from drivers.dynamixel.virtual.timing import realtime_timers
 
@@ -40,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
             linger_s=0.0004 if args.wire_time else 0.0,
             seed=args.seed,
         )
-        faults = [_fault(text) for text in args.fault]
+        faults = [parse(text) for text in args.fault]
     except (ValueError, LookupError) as e:
         sys.stderr.write(f"virtual servo: {e}\n")
         return 2
@@ -64,17 +68,13 @@ async def _serve(bus: VirtualServoBus, faults: list[tuple[str, dict[str, float]]
         ids = ", ".join(str(s.servo_id) for s in bus.servos)
         sys.stdout.write(f"{bus.servos[0].table.title}, id {ids}, {bus.baud_n} bit/s, at {bus.link}\n")
         sys.stdout.flush()
+        console = Console(bus, sys.stdin.fileno(), sys.stdout)
+        console.start()
         await done.wait()
+        console.stop()
     finally:
         with contextlib.suppress(OSError):
             await bus.close()
-
-
-def _fault(text: str) -> tuple[str, dict[str, float]]:
-    """``name`` or ``name:key=value,key=value``."""
-    name, _, rest = text.partition(":")
-    pairs = (pair.partition("=") for pair in rest.split(",") if pair)
-    return name, {key: float(value) for key, _, value in pairs}
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -246,7 +246,7 @@ class VirtualServoBus:
 
     def _take(self) -> bytes:
         try:
-            return os.read(self._master, 4096) if self._master >= 0 else b""
+            return os.read(self._master, 1 if "trickle" in self._faults else 4096) if self._master >= 0 else b""
         except (BlockingIOError, OSError):
             return b""
 

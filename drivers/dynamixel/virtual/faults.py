@@ -13,6 +13,22 @@ class FaultKind:
     params: dict[str, float] = field(default_factory=dict)
 
 
+def parse(text: str, separator: str = ",") -> tuple[str, dict[str, float]]:
+    """``name`` and parameters from ``name:key=value,key=value`` (or with spaces, for the console).
+
+    Raises:
+        ValueError: a parameter is not ``key=number``.
+    """
+    name, _, rest = text.strip().replace(":", " ", 1).partition(" ")
+    params: dict[str, float] = {}
+    for pair in filter(None, (p.strip() for p in rest.replace(separator, " ").split(" "))):
+        key, equals, value = pair.partition("=")
+        if not equals:
+            raise ValueError(f"{pair!r} is not key=number")
+        params[key] = float(value)
+    return name, params
+
+
 ALERT_BITS = {
     "alert_voltage": 0x01,
     "alert_hall_sensor": 0x02,
@@ -32,7 +48,7 @@ FAULTS: dict[str, FaultKind] = {
     "echo": FaultKind("the adapter echoes what the host sends"),
     "foreign_id": FaultKind("status packets carry another servo's id", {"servo_id": 99}),
     "noise": FaultKind("stray bytes before status packets", {"bytes_n": 7}),
-    "trickle": FaultKind("status packets come one byte at a time", {"gap_s": 0.0003}),
+    "trickle": FaultKind("bytes come and go one at a time", {"gap_s": 0.0003}),
     "unplug": FaultKind("the cable is pulled: port and link vanish"),
     # in the servo
     "power_cut": FaultKind("the 24 V supply fails; back after `seconds`, 0: when faults are cleared", {"seconds": 0.0}),

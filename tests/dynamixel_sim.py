@@ -1,0 +1,126 @@
+"""Virtual servos for tests: on the test's own event loop, or in a process of their own beside clients that block."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drivers.dynamixel import Ph54Rotator
+from drivers.dynamixel.virtual import VirtualServo, VirtualServoBus
+from graderd.hal.settings import RotatorSettings
+
+PATIENCE_S = 15.0
+"""Deadline of waits in tests: long, because the machine may be busy; nothing is measured by it."""
+
+
+@dataclass
+class Bench:
+    """A rotator and the virtual servo it drives."""
+
+    rotator: Ph54Rotator
+    servo: VirtualServo
+    bus: VirtualServoBus
+
+    def conditions(self) -> set[str]:
+        return {f.condition for f in self.rotator.faults()}
+
+    async def until(self, met: Callable[[], object], what: str = "", timeout_s: float = PATIENCE_S) -> None:
+        """Wait until ``met()`` is true, looking every few milliseconds."""
+        await until(met, what or f"not met; faults {self.conditions()}", timeout_s)
+
+    async def drive(self, goal_deg: float, met: Callable[[], object], timeout_s: float = PATIENCE_S) -> None:
+        """Renew a goal every 20 ms, as the control tick does, until ``met()`` is true."""
+        deadline_s = time.monotonic() + timeout_s
+        while not met():
+            assert time.monotonic() < deadline_s, f"{self.rotator.lifecycle} {self.rotator.faults()}"
+            self.rotator.set_goal_deg(goal_deg)
+            await asyncio.sleep(0.02)
+
+    def at(self, angle_deg: float, tolerance_deg: float = 0.5) -> Callable[[], bool]:
+        """Condition: the measured angle is there."""
+
+        def there() -> bool:
+            angle = self.rotator.telemetry().angle_deg
+            return angle is not None and abs(angle.value - angle_deg) <= tolerance_deg
+
+        return there
+
+
+async def until(met: Callable[[], object], what: str, timeout_s: float = PATIENCE_S) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not met():
+        assert time.monotonic() < deadline_s, what
+        await asyncio.sleep(0.005)
+
+
+@asynccontextmanager
+async def bench(
+    folder: Path,
+    servo: VirtualServo | None = None,
+    *,
+    opened: bool = True,
+    wire: dict[str, Any] | None = None,
+    **changes: Any,
+) -> AsyncIterator[Bench]:
+    """A virtual servo at ``folder/servo`` and a rotator on it, opened unless told otherwise; all closed at the end."""
+    servo = servo or VirtualServo()
+    bus = VirtualServoBus([servo], folder / "servo", **(wire or {}))
+    settings = RotatorSettings(**{"port": str(folder / "servo"), **changes})
+    rotator = Ph54Rotator(settings)
+    await bus.start()
+    try:
+        if opened:
+            await rotator.open()
+        yield Bench(rotator, servo, bus)
+    finally:
+        await rotator.close()
+        await bus.close()
+
+
+class ServoProcess:
+    """``python -m drivers.dynamixel.virtual`` in a process of its own; commands by its standard input."""
+
+    def __init__(self, link: Path, *arguments: str) -> None:
+        self.link = link
+        command = [sys.executable, "-m", "drivers.dynamixel.virtual", "--link", str(link), *arguments]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.hello = self._line()
+
+    def _line(self) -> str:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, "the virtual servo died"
+        return line
+
+    def tell(self, command: str) -> dict[str, Any]:
+        """Send a console line; returns the answer."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(command + "\n")
+        self.process.stdin.flush()
+        answer: dict[str, Any] = json.loads(self._line())
+        return answer
+
+    def end(self) -> int:
+        self.process.terminate()
+        code = self.process.wait(timeout=PATIENCE_S)
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe is not None:
+                pipe.close()
+        return code
+
+
+@contextmanager
+def servo_process(link: Path, *arguments: str) -> Iterator[ServoProcess]:
+    process = ServoProcess(link, *arguments)
+    try:
+        yield process
+    finally:
+        process.end()
