@@ -276,6 +276,14 @@ class ControlLoop:
         if self.state.mode is Mode.DISARMED and any(isinstance(command, cmd.Arm) for command in commands):
             self.faults = clear_faults(self.faults, Clear.ON_REARM)
 
+    def published_faults(self) -> tuple[DeviceFault, ...]:
+        """The active faults as the bus publishes them."""
+        return tuple(
+            DeviceFault(device, condition, fault.detail, fault.since_s)
+            for fault in self.faults.active
+            for device, _, condition in (fault.name.partition("."),)
+        )
+
     @property
     def goals(self) -> Goals:
         """What the machine asks for now."""

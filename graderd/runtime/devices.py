@@ -36,7 +36,7 @@ class Link(Protocol):
 Service = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 
 
-def _publish_nowhere(names: tuple[str, ...]) -> None:
+def _publish_nowhere(faults: tuple[DeviceFault, ...], stopped: bool) -> None:
     """Where there is no bus to tell."""
 
 
@@ -48,8 +48,8 @@ class Devices:
     link: Link
     actuators: dict[str, LinearActuator]
     services: dict[str, Service] = field(default_factory=dict)
-    publish_faults: Callable[[tuple[str, ...]], None] = _publish_nowhere
-    """Puts the names of the active faults on the bus as diagnostic messages (DM1)."""
+    publish_faults: Callable[[tuple[DeviceFault, ...], bool], None] = _publish_nowhere
+    """Puts the active faults, and whether the machine is stopped, on the bus as diagnostic messages (DM1)."""
 
     def all(self) -> dict[str, Rotator | LinearActuator]:
         """The axes by device name."""

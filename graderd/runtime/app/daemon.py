@@ -11,8 +11,6 @@ import sys
 import time
 from pathlib import Path
 
-from graderd.runtime.app.devices import build_devices
-
 from graderd.api import make_app
 from graderd.api.server import serve
 from graderd.config import Config, ConfigError, load
@@ -20,6 +18,7 @@ from graderd.core import commands as cmd
 from graderd.core.machine import Mode
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
+from graderd.runtime.app.devices import build_devices
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.health import HealthWatch
@@ -41,16 +40,17 @@ def run_daemon(config_path: Path | None, sim: bool, rig_dir: Path | None, as_jso
     try:
         config = load(config_path)
     except ConfigError as error:
-        for problem in error.problems:
-            log.error("%s", problem)
+        for line in error.problems:
+            log.error("%s", line)
         return 2
+    problems: list[DeviceError] = []
     try:
         asyncio.run(_main(config, sim, rig_dir))
     except* DeviceError as group:
-        for leaf in _leaves(group):
-            log.error("%s", leaf)
-        return 1
-    return 0
+        problems = _leaves(group)
+    for problem in problems:
+        log.error("%s", problem)
+    return 1 if problems else 0
 
 
 async def _main(config: Config, sim: bool, rig_dir: Path | None) -> None:
@@ -100,7 +100,7 @@ class Daemon:
         self._notifier.feed_watchdog()
         self._port.published()
         self._recorder.take(self._loop.time_s, self._port.status)
-        self._devices.publish_faults(tuple(f.name for f in self._loop.faults.active))
+        self._devices.publish_faults(self._loop.published_faults(), self._loop.state.mode is Mode.STOPPED)
         if self._loop.time_s >= self._status_line_due_s:
             self._status_line_due_s = self._loop.time_s + STATUS_LINE_S
             self._notifier.status(f"{self._loop.state.mode}: {self._loop.state.reason}")
@@ -198,6 +198,3 @@ def _leaves(group: BaseExceptionGroup[DeviceError]) -> list[DeviceError]:
         elif error not in found:
             found.append(error)
     return found
-
-
-__all__ = ["Daemon", "Mode", "run_daemon", "set_up_logging"]

@@ -20,6 +20,7 @@ import httpx
 
 from drivers.rig.control import RigControl
 from graderd.core.status import Status
+from graderd.hal.errors import DeviceError
 from graderd.runtime.app.show import Show, make_show
 from graderd.runtime.app.sim import RigProcess, new_rig_directory
 
@@ -31,7 +32,7 @@ START_TIMEOUT_S = 60.0
 DECISION_TIMEOUT_S = 20.0
 SETTLE_TIMEOUT_S = 15.0
 SETTLED_DEG = 0.5
-SETTLED_FOR_S = 0.3
+SETTLED_FOR_S = 0.5
 DRIVE_M = 3.0
 DRIVE_M_PER_S = 1.0
 
@@ -66,13 +67,13 @@ async def _demo(show: Show) -> int:
     passes: list[Pass] = []
     problem = ""
     try:
-        async with _machine(directory, show) as client:
-            demo = _Demo(client, RigControl(directory / "control.sock"), show)
+        async with _machine(directory, show) as client, RigControl(directory / "control.sock") as control:
+            demo = _Demo(client, control, show)
             await demo.arm()
             for zone in ZONES:
                 passes.append(await demo.one_pass(zone))
             await demo.command("disarm")
-    except (DemoFailedError, httpx.HTTPError, OSError) as error:
+    except (DemoFailedError, DeviceError, httpx.HTTPError, OSError) as error:
         problem = str(error) or repr(error)
     finally:
         shutil.rmtree(directory, ignore_errors=True)
@@ -95,7 +96,7 @@ async def _machine(directory: Path, show: Show) -> AsyncIterator[httpx.AsyncClie
     log_path = directory / "daemon.log"
     with log_path.open("wb") as log_file:
         daemon = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "graderd", "run", "--sim"),
+            *(sys.executable, "-m", "graderd", "run"),
             *("--config", str(config_path), "--rig-dir", str(directory)),
             stdout=log_file,
             stderr=log_file,
@@ -180,10 +181,8 @@ class _Demo:
         decided = str(started.decision.zone)
         self._show.event("decision", zone=decided, requested_deg=requested_deg, confidence=started.soil.confidence)
         decided_s = started.time_s - (started.decision.age_s or 0.0)
-        settled = await self._settled(requested_deg)
-        measured_deg = settled.axes["rotation"].measured
-        assert measured_deg is not None
-        result = Pass(zone, decided, requested_deg, round(measured_deg, 3), round(settled.time_s - decided_s, 3))
+        settled_s, measured_deg = await self._settled(requested_deg)
+        result = Pass(zone, decided, requested_deg, round(measured_deg, 3), round(settled_s - decided_s, 3))
         self._show.event("settled", **asdict(result))
         await self._drive()
         return result
@@ -205,8 +204,8 @@ class _Demo:
             await asyncio.sleep(POLL_S)
         raise DemoFailedError("the blade did not come back to 0°")
 
-    async def _settled(self, goal_deg: float) -> Status:
-        """The first status from which on the measured angle stays at the goal."""
+    async def _settled(self, goal_deg: float) -> tuple[float, float]:
+        """When the measured angle came to the goal to stay, and where it is after it stayed for a while."""
         first: Status | None = None
         deadline_s = time.monotonic() + SETTLE_TIMEOUT_S
         while time.monotonic() < deadline_s:
@@ -217,7 +216,7 @@ class _Demo:
             elif first is None:
                 first = status
             elif status.time_s - first.time_s >= SETTLED_FOR_S:
-                return first
+                return first.time_s, measured
             await asyncio.sleep(POLL_S)
         raise DemoFailedError(f"the blade did not settle at {goal_deg:+.0f}°")
 

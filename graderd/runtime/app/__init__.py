@@ -1,0 +1,29 @@
+"""The wiring: daemon, perception child, guard and demonstration. The only package that imports drivers.
+
+The functions import what they need when called, so that ``graderd --help`` and the other clients start fast.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def run_daemon(config_path: Path | None, sim: bool, rig_dir: Path | None, as_json: bool) -> int:
+    """See :func:`graderd.runtime.app.daemon.run_daemon`."""
+    from graderd.runtime.app.daemon import run_daemon as run
+
+    return run(config_path, sim, rig_dir, as_json)
+
+
+def run_demo(as_json: bool) -> int:
+    """See :func:`graderd.runtime.app.demo.run_demo`."""
+    from graderd.runtime.app.demo import run_demo as run
+
+    return run(as_json)
+
+
+def run_guard(config_path: Path | None) -> int:
+    """See :func:`graderd.runtime.app.guard.run_guard`."""
+    from graderd.runtime.app.guard import run_guard as run
+
+    return run(config_path)

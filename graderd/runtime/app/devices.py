@@ -1,0 +1,43 @@
+"""Builds the devices from the configuration. Here, and in this package only, drivers are imported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from drivers.dynamixel.ph54 import Ph54Rotator
+from drivers.electrak.actuator import ElectrakActuator
+from drivers.electrak.link import CanLink
+from graderd.config import Config
+from graderd.hal.clock import Clock
+from graderd.hal.fault import DeviceFault
+from graderd.hal.linear_actuator import LinearActuator
+from graderd.runtime.devices import ACTUATOR_NAMES, Devices
+
+
+def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], None]) -> Devices:
+    """All devices, closed. ``on_bus_stop`` is called for a stop message on the CAN bus."""
+    rotator = Ph54Rotator(config.rotation, clock)
+    link = CanLink(config.can, clock, on_stop=on_bus_stop)
+    actuators: dict[str, LinearActuator] = {
+        name: ElectrakActuator(name, getattr(config, name), link, clock) for name in ACTUATOR_NAMES
+    }
+
+    async def verify_profile(_: dict[str, Any]) -> dict[str, Any]:
+        return {"differences": [asdict(difference) for difference in await rotator.verify_profile()]}
+
+    async def reboot(_: dict[str, Any]) -> dict[str, Any]:
+        await rotator.reboot()
+        return {"rebooted": True}
+
+    def publish(faults: tuple[DeviceFault, ...], stopped: bool) -> None:
+        link.publish_faults(faults, stopped=stopped)
+
+    return Devices(
+        rotation=rotator,
+        link=link,
+        actuators=actuators,
+        services={"rotation.verify_profile": verify_profile, "rotation.reboot": reboot},
+        publish_faults=publish,
+    )
