@@ -79,7 +79,8 @@ def run_app(arguments: list[str]) -> int:
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "graderd"
         where = path.removeprefix("graderd").strip()
-        print_error(where, error.format_message(), f"See '{path} --help'", as_json)
+        if error.format_message():  # a group without a command has printed its help instead
+            print_error(where, error.format_message(), f"See '{path} --help'", as_json)
         return ExitCode.USAGE if error.exit_code == ExitCode.USAGE else ExitCode.FAILED
     except Abort:
         return ExitCode.FAILED

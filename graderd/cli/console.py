@@ -40,8 +40,9 @@ class CliError(Exception):
 def error_line(where: str, cause: str, remedy: str = "") -> str:
     """``graderd: WHERE: why. What to do``, in one line whatever the parts contain."""
     head = f"graderd: {where}: {cause}" if where else f"graderd: {cause}"
-    text = f"{head.rstrip('.')}. {remedy}" if remedy else head
-    return " ".join(text.split())
+    if remedy and not remedy.startswith("graderd "):
+        remedy = remedy[0].upper() + remedy[1:]
+    return " ".join((f"{head.rstrip('.')}. {remedy}" if remedy else head).split())
 
 
 def print_error(where: str, cause: str, remedy: str, as_json: bool) -> None:

@@ -86,7 +86,10 @@ def register(app: typer.Typer) -> None:
         timeout_s: Annotated[float, typer.Option(min=0.1, help="Fail if it has not arrived by then.")] = 60.0,
         json: Json = False,
     ) -> None:
-        """Move one axis by hand, in manual mode. The blade holds when the command ends, however it ends."""
+        """Move one axis by hand, in manual mode.
+
+        The blade holds when the command ends, however it ends.
+        """
         wish = parse_value(axis.value, value)
         command = {"command": "jog", "axis": axis.value, "value": wish.value, "relative": wish.relative}
         move(daemon_of(context), command, MOVED_BY[axis.value], hold_s, timeout_s, json)

@@ -20,7 +20,10 @@ def register(app: typer.Typer) -> None:
 
     @app.command(epilog=example("graderd arm && graderd auto"))
     def arm(context: typer.Context, json: Json = False) -> None:
-        """Power the devices and hold. Lists what is met and what is not, and refuses while anything needed is not."""
+        """Power the devices and hold.
+
+        Lists what is met and what is not, and refuses while anything needed is not.
+        """
         daemon = daemon_of(context)
         refusal: CliError | None = None
         try:
@@ -52,7 +55,10 @@ def register(app: typer.Typer) -> None:
         reason: Annotated[str, typer.Option(help="Kept as the reason of the stop.")] = "stop command",
         json: Json = False,
     ) -> None:
-        """End motion at once. Wins over everything and stays until reset."""
+        """End motion at once.
+
+        Wins over everything and stays until reset.
+        """
         try:
             body = {"client": client_name()[:80], "reason": reason[:200]}
             _tell(daemon_of(context).post("/v1/stop", body), json)

@@ -22,7 +22,10 @@ def register(app: typer.Typer) -> None:
         timeout_s: Annotated[float, typer.Option(min=0.1, help="Fail if it has not arrived by then.")] = 120.0,
         json: Json = False,
     ) -> None:
-        """Move to a named pose of the configuration, in manual mode. The blade holds when the command ends."""
+        """Move to a named pose, in manual mode.
+
+        The poses are the configuration's. The blade holds when the command ends.
+        """
         daemon = daemon_of(context)
         names = daemon.get("/v1/status")["presets"]
         if name is None:

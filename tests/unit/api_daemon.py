@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from graderd.api.app import make_app
 from graderd.api.port import ServiceError
@@ -20,6 +20,8 @@ from graderd.core.machine import Goals, Inputs, Lease, MachineSettings, Mode, Po
 from graderd.core.rule import RuleSettings
 from graderd.core.status import AttitudeStatus, AxisStatus, LeaseStatus, RequirementStatus, SoilStatus, Status
 from graderd.hal.lifecycle import Lifecycle
+
+T = TypeVar("T")
 
 TICK_S = 0.02
 SPEED_PER_S = {"rotation": 60.0, "lift_left": 200.0, "lift_right": 200.0, "tilt": 100.0}
@@ -234,6 +236,12 @@ class FakeDaemon:
     def hold_lease(self, client: str) -> None:
         """Let somebody else have the lease for a minute."""
         self.state = replace(self.state, lease=Lease(client, time.monotonic() + 60.0))
+
+
+async def within(timeout_s: float, awaitable: Awaitable[T]) -> T:
+    """Wait for it, not for ever."""
+    async with asyncio.timeout(timeout_s):
+        return await awaitable
 
 
 @asynccontextmanager

@@ -21,7 +21,7 @@ from graderd.api.server import SocketError, SocketInUseError, serve
 from graderd.api.settings import ApiLimits
 from graderd.core.machine import Mode, Unmet
 from graderd.core.status import Status
-from tests.unit.api_daemon import JPEG, FakeDaemon, serving
+from tests.unit.api_daemon import JPEG, FakeDaemon, serving, within
 
 
 @contextlib.asynccontextmanager
@@ -123,7 +123,7 @@ async def test_a_body_that_never_ends_is_given_up(tmp_path: Path) -> None:
     async with serving(tmp_path, limits=ApiLimits(body_timeout_s=0.2)) as (_, path):
         reader, writer = await asyncio.open_unix_connection(str(path))
         writer.write(b"POST /v1/commands HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\n{")
-        assert b"408" in await asyncio.wait_for(reader.readline(), 5)
+        assert b"408" in await within(5, reader.readline())
         writer.close()
         await writer.wait_closed()
 

@@ -13,7 +13,7 @@ from graderd.api.settings import ApiLimits
 from graderd.cli.console import CliError
 from graderd.cli.jog import JogValue, parse_value
 from graderd.core.machine import Mode
-from tests.unit.api_daemon import FakeDaemon, serving
+from tests.unit.api_daemon import FakeDaemon, serving, within
 from tests.unit.test_cli_modes import Capture, cli, command_line
 
 
@@ -88,8 +88,8 @@ async def test_a_jog_ends_on_arrival_and_gives_the_lease_back(
 @pytest.mark.parametrize(
     ("mode", "arguments", "says"),
     [
-        (None, ["jog", "rotate", "+5deg"], "arm first"),
-        ("auto", ["jog", "rotate", "+5deg"], "send manual first"),
+        (None, ["jog", "rotate", "+5deg"], "Arm first"),
+        ("auto", ["jog", "rotate", "+5deg"], "Send manual first"),
         ("manual", ["jog", "rotate", "100deg"], "beyond the limit of +60.0 deg"),
         ("manual", ["preset", "moon"], "there is no preset 'moon'"),
     ],
@@ -144,7 +144,7 @@ async def test_a_stop_ends_the_jog_and_the_command_says_why(tmp_path: Path, caps
         jog = asyncio.create_task(cli(path, "jog", "rotate", "+50deg", "--hold-s", "20"), name="jog")
         await daemon.until(lambda: daemon.state.lease is not None)
         assert await cli(path, "stop", "--reason", "enough") == 0
-        assert await asyncio.wait_for(jog, 10) == 1
+        assert await within(10, jog) == 1
         said = capsys.readouterr().err
         assert "stopped, enough" in said
 
@@ -178,7 +178,7 @@ async def test_a_stalled_client_loses_its_lease(tmp_path: Path) -> None:
         assert "lapsed" in daemon.state.reason
         stood = dict(daemon.positions)
         process.send_signal(signal.SIGCONT)
-        _, said = await asyncio.wait_for(process.communicate(), 10)
+        _, said = await within(10, process.communicate())
         assert process.returncode == 1
         assert b"lapsed" in said
         assert daemon.positions == stood

@@ -11,7 +11,7 @@ import pytest
 
 from graderd.cli.app import run_app
 from graderd.core.machine import Mode, Unmet
-from tests.unit.api_daemon import FakeDaemon, serving
+from tests.unit.api_daemon import FakeDaemon, serving, within
 
 Capture = pytest.CaptureFixture[str]
 
@@ -35,7 +35,7 @@ async def test_from_disarmed_to_auto_and_stopped(tmp_path: Path, capsys: Capture
         assert await cli(path, "arm") == 1
         said = capsys.readouterr()
         assert said.err.startswith("graderd: arm: stopped: enough")
-        assert said.err.endswith("reset first, then arm\n")
+        assert said.err.endswith("Reset first, then arm\n")
         assert said.err.count("\n") == 1
         assert await cli(path, "reset") == 0
         assert daemon.status().mode is Mode.DISARMED
@@ -50,7 +50,7 @@ async def test_arm_lists_what_is_unmet(tmp_path: Path, capsys: Capture) -> None:
         said = capsys.readouterr()
         assert "UNMET" in said.out
         assert "camera fresh" in said.out
-        assert "look at the camera's cable" in said.err
+        assert "Look at the camera's cable" in said.err
         assert await cli(path, "arm", "--json") == 1
         problem = json.loads(capsys.readouterr().out)
         assert problem == {
@@ -85,7 +85,7 @@ async def test_watch_prints_one_object_a_line(tmp_path: Path) -> None:
             *command_line(path, "status", "--watch", "--json"), stdout=asyncio.subprocess.PIPE
         )
         assert process.stdout is not None
-        times = [json.loads(await asyncio.wait_for(process.stdout.readline(), 20))["time_s"] for _ in range(3)]
+        times = [json.loads(await within(20, process.stdout.readline()))["time_s"] for _ in range(3)]
         assert times == sorted(set(times))
         process.terminate()
         await process.wait()
@@ -103,7 +103,7 @@ def test_no_daemon_is_exit_status_3(tmp_path: Path, capsys: Capture, command: st
     assert run_app(["--socket", str(path), command]) == 3
     said = capsys.readouterr()
     assert said.out == ""
-    assert said.err.startswith(f"graderd: {path}: no daemon serves this socket. start it with")
+    assert said.err.startswith(f"graderd: {path}: no daemon serves this socket. Start it with")
     assert said.err.count("\n") == 1
     if command == "stop":
         assert "emergency stop" in said.err

@@ -72,7 +72,7 @@ ROWS = (
         "actuator.fatal",
         "an actuator reports a fault that needs service",
         "damaged electronics or mechanics",
-        "cut and restore its power; exchange it if the report comes back",
+        "cut and restore its power, then arm; exchange it if the report comes back",
         Reaction.DISARM,
         clear=Clear.ON_REARM,
     ),

@@ -45,7 +45,7 @@ ROWS = (
         "can.address_conflict",
         "another device on the CAN bus uses graderd's address",
         "a second controller, or a second graderd, with the same address or name",
-        "give it another address, or graderd another source_address_n",
+        "give it another address, or graderd another source_address_n; then arm",
         # Messages that look like ours may command the actuators.
         Reaction.DISARM,
         clear=Clear.ON_REARM,

@@ -1,0 +1,87 @@
+"""``graderd rotation reboot | step``: services of the servo that turns the blade."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from graderd.cli.client import daemon_of
+from graderd.cli.console import CliError, ExitCode, Json, for_people, print_json, print_table, print_text
+from graderd.cli.epilog import example
+
+SERVICE_S = 120.0
+Yes = Annotated[
+    bool, typer.Option("--yes", help="You have looked: nobody is near the blade, and it may move or lose its power.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    rotation = typer.Typer(help="Services of the blade's servo.", no_args_is_help=True)
+    app.add_typer(rotation, name="rotation")
+
+    @rotation.command(epilog=example("graderd rotation reboot --yes"))
+    def reboot(context: typer.Context, yes: Yes = False, json: Json = False) -> None:
+        """Reboot the servo, which clears its alerts.
+
+        Disarmed only; the blade has no torque for a moment.
+        """
+        need_consent("rotation reboot", "the blade loses its torque for a moment", yes)
+        answer = daemon_of(context).service("rotation.reboot", SERVICE_S, consent=True)
+        if json:
+            print_json(answer)
+        else:
+            print_text("the servo has restarted; arm when its alerts are gone")
+
+    @rotation.command(epilog=example("graderd rotation step --by-deg 10 --report step.html --yes"))
+    def step(
+        context: typer.Context,
+        by_deg: Annotated[float, typer.Option(min=-45.0, max=45.0, help="Size of the step.")] = 10.0,
+        report: Annotated[Path | None, typer.Option(help="Write the report page (HTML) here.")] = None,
+        yes: Yes = False,
+        json: Json = False,
+    ) -> None:
+        """Turn the blade by a step and back, and report.
+
+        Rise, overshoot, settling and play, with the settings used. Disarmed only.
+        """
+        need_consent("rotation step", f"the blade turns by {by_deg:+g} degrees and back", yes)
+        answer = daemon_of(context).service("rotation.step_response", SERVICE_S, consent=True, step_deg=by_deg)
+        page = answer.pop("report_html", None)
+        if report is not None:
+            _write(report, page)
+        if json:
+            print_json(answer)
+        else:
+            print_table("Step response", ("", ""), [(name, _text(value)) for name, value in answer.items()])
+            if report is not None:
+                print_text(f"report: {report}")
+
+
+def need_consent(where: str, what: str, yes: bool) -> None:
+    """Ask the person at the terminal, unless ``--yes`` was given.
+
+    Raises:
+        CliError: no, or nobody to ask.
+    """
+    if yes:
+        return
+    if not for_people():
+        raise CliError(where, f"{what}, and nobody is there to agree", "repeat with --yes", ExitCode.USAGE)
+    if not typer.confirm(f"{what.capitalize()}. Is nobody near it?"):
+        raise CliError(where, "not agreed; nothing was done")
+
+
+def _write(report: Path, page: Any) -> None:
+    if not isinstance(page, str):
+        raise CliError("rotation step", "the daemon gave no report page", "see its log")
+    try:
+        report.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise CliError(str(report), f"cannot be written: {error.strerror}", "choose another --report") from error
+
+
+def _text(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,178 @@
+"""The WebSockets: a stream that never piles up, and a jog whose lease ends with its connection."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.asyncio.client import ClientConnection, unix_connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from graderd.api.settings import ApiLimits
+from graderd.core import commands as cmd
+from graderd.core.machine import Mode
+from graderd.core.status import Status
+from tests.unit.api_daemon import FakeDaemon, serving, within
+
+
+def connect(path: Path, target: str) -> Any:
+    return unix_connect(str(path), f"ws://localhost{target}", compression=None)
+
+
+async def ask(socket: ClientConnection, **message: Any) -> dict[str, Any]:
+    await socket.send(json.dumps(message))
+    answer: dict[str, Any] = json.loads(await within(5, socket.recv()))
+    return answer
+
+
+async def armed(daemon: FakeDaemon) -> None:
+    assert (await daemon.command(cmd.Arm())).accepted
+    await daemon.until_mode(Mode.MANUAL)
+
+
+async def test_the_stream_sends_newer_and_newer_statuses_at_the_rate_asked_for(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (_, path):
+        for rate_hz, target in ((20.0, "/v1/stream"), (10.0, "/v1/stream?rate_hz=10"), (20.0, "/v1/stream?rate_hz=99")):
+            async with connect(path, target) as socket:
+                begin_s = asyncio.get_running_loop().time()
+                times = [Status.model_validate_json(await socket.recv()).time_s for _ in range(8)]
+                took_s = asyncio.get_running_loop().time() - begin_s
+            assert times == sorted(set(times))
+            assert took_s >= 7 / rate_hz * 0.95
+
+
+async def test_a_slow_client_gets_no_old_statuses_and_makes_nothing_grow(tmp_path: Path) -> None:
+    async with serving(tmp_path, limits=ApiLimits(stream_max_hz=1000.0)) as (daemon, path):
+        reader, writer = await asyncio.open_unix_connection(str(path), limit=4096)
+        writer.write(
+            b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+            b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        )
+        await reader.readuntil(b"\r\n\r\n")
+        sent: list[float] = []
+        make_text = Status.model_dump_json
+
+        def counted(status: Status, **options: Any) -> str:
+            sent.append(status.time_s)
+            return make_text(status, **options)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Status, "model_dump_json", counted)
+            begin_n = len(daemon.late_s)
+            await daemon.until(lambda: len(daemon.late_s) > begin_n + 100)
+            stuck_n = len(sent)
+            await daemon.until(lambda: len(daemon.late_s) > begin_n + 150)
+        assert stuck_n < 40  # what fits into two socket buffers and asyncio's reader, not 100 ticks
+        assert len(sent) == stuck_n
+        writer.close()
+        await writer.wait_closed()
+
+
+async def test_a_jog_moves_while_it_is_renewed(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        await armed(daemon)
+        async with connect(path, "/v1/jog?client=cab") as socket:
+            reply = await ask(socket, command="jog", axis="rotate", value=10.0)
+            assert reply == {
+                "command": "jog",
+                "accepted": True,
+                "message": "moving while the lease is renewed",
+                "remedy": "",
+            }
+            assert daemon.state.lease is not None
+            assert daemon.state.lease.client.startswith("cab#")
+            while daemon.positions["rotation"] < 10.0:
+                assert (await ask(socket, command="renew"))["accepted"]
+            assert (await ask(socket, command="release"))["message"] == "released; holding"
+            assert daemon.status().lease is None
+
+
+@pytest.mark.parametrize("how", ["close", "abort"])
+async def test_the_lease_is_given_back_when_the_client_goes(tmp_path: Path, how: str) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        await armed(daemon)
+        socket = await connect(path, "/v1/jog")
+        assert (await ask(socket, command="jog", axis="rotate", value=50.0))["accepted"]
+        if how == "close":
+            await socket.close()
+        else:
+            socket.transport.abort()
+        await daemon.until(lambda: daemon.state.lease is None, timeout_s=1.0)
+        assert daemon.state.reason == "released"
+        assert daemon.positions["rotation"] < 30.0
+
+
+async def test_nobody_keeps_somebody_elses_lease(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        await armed(daemon)
+        async with connect(path, "/v1/jog?client=a") as first, connect(path, "/v1/jog?client=a") as second:
+            assert (await ask(first, command="jog", axis="tilt", value=60.0))["accepted"]
+            # The same name, and even the first one's full name, does not make the second the first.
+            assert daemon.state.lease is not None
+            stolen = await ask(second, command="renew", client=daemon.state.lease.client)
+            assert stolen["accepted"] is False
+            assert stolen["message"] == "you hold no lease"
+            refused = await ask(second, command="jog", axis="tilt", value=10.0)
+            assert "is moving the blade" in refused["message"]
+            await second.close()
+            assert (await ask(first, command="renew"))["accepted"]
+
+
+async def test_malformed_messages_are_answered_and_slow_the_client_down(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path), connect(path, "/v1/jog") as socket:
+        begin_s = asyncio.get_running_loop().time()
+        for text in ("", "{", "[]", '{"command": "fly"}', b"\xff\xfe"):
+            await socket.send(text)
+            problem = json.loads(await within(5, socket.recv()))
+            assert set(problem) == {"error", "where", "remedy"}
+        assert asyncio.get_running_loop().time() - begin_s > 0.4
+        assert daemon.seen == []
+        assert (await ask(socket, command="stop"))["accepted"]
+
+
+async def test_a_message_that_is_too_large_ends_the_connection_and_the_lease(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        await armed(daemon)
+        async with connect(path, "/v1/jog") as socket:
+            assert (await ask(socket, command="jog", axis="rotate", value=50.0))["accepted"]
+            await socket.send("x" * 100_000)
+            with pytest.raises(ConnectionClosed):
+                await socket.recv()
+        await daemon.until(lambda: daemon.state.lease is None, timeout_s=1.0)
+
+
+async def test_streams_are_bounded(tmp_path: Path) -> None:
+    async with serving(tmp_path, limits=ApiLimits(websockets_max_n=2)) as (_, path):
+        async with connect(path, "/v1/stream") as one, connect(path, "/v1/stream") as two:
+            await asyncio.gather(one.recv(), two.recv())
+            with pytest.raises(InvalidStatus) as refused:
+                await connect(path, "/v1/jog")
+            assert refused.value.response.status_code == 503
+            assert b"streams are open already" in (refused.value.response.body or b"")
+        async with connect(path, "/v1/stream") as again:
+            await again.recv()
+
+
+@pytest.mark.parametrize("target", ["/v1/stream?rate_hz=0", "/v1/stream?rate_hz=nan", "/v1/nothing"])
+async def test_what_is_no_stream_is_refused(tmp_path: Path, target: str) -> None:
+    async with serving(tmp_path) as (_, path):
+        with pytest.raises(InvalidStatus):
+            await connect(path, target)
+
+
+async def test_the_daemons_end_ends_the_streams(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        await armed(daemon)
+        stream, jog = await connect(path, "/v1/stream"), await connect(path, "/v1/jog")
+        assert (await ask(jog, command="jog", axis="rotate", value=50.0))["accepted"]
+        await stream.recv()
+        begin_s = asyncio.get_running_loop().time()
+    assert asyncio.get_running_loop().time() - begin_s < 1.5
+    for socket in (stream, jog):
+        await within(2, socket.wait_closed())
+        assert socket.close_code in (1001, 1012)
+    assert daemon.state.lease is None
+    assert [record for record in caplog.records if record.levelname == "ERROR"] == []

@@ -1,0 +1,182 @@
+"""Commands that need no daemon: help, explain, config, hand-overs, consent."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from graderd.cli.app import make_cli, run_app
+from graderd.core.fault_catalogue import CATALOGUE
+from tests.unit.api_daemon import serving
+from tests.unit.test_cli_modes import Capture, cli
+
+
+def leaf_commands() -> list[list[str]]:
+    """The words of every command that does something."""
+
+    def walk(group: Any, words: list[str]) -> list[list[str]]:
+        found: list[list[str]] = []
+        for name, command in group.commands.items():
+            below = [*words, name]
+            found += walk(command, below) if hasattr(command, "commands") else [below]
+        return found
+
+    return walk(get_command(make_cli()), [])
+
+
+@pytest.mark.parametrize("words", leaf_commands(), ids=" ".join)
+def test_every_command_has_help_with_an_example_and_json(words: list[str]) -> None:
+    result = CliRunner().invoke(make_cli(), [*words, "--help"])
+    assert result.exit_code == 0
+    assert "Example" in result.output
+    assert f"graderd {' '.join(words)}" in " ".join(result.output.split())
+    # `rig` and `can dump` hand over to programs that know --json themselves or announce themselves as JSON.
+    assert "--json" in result.output or "JSON" in result.output
+
+
+def test_all_commands_of_the_issue_are_there() -> None:
+    assert {" ".join(words) for words in leaf_commands()} >= {
+        *("run", "demo", "rig", "guard", "status", "arm", "disarm", "stop", "reset", "auto", "manual", "jog"),
+        *("preset", "explain", "config check", "config show", "rotation reboot", "rotation step"),
+        *("profile verify", "can dump", "classify", "calibrate camera"),
+    }
+
+
+def test_explain_prints_everything_about_a_fault(capsys: Capture) -> None:
+    row = CATALOGUE["actuator.overload"]
+    assert run_app(["explain", "tilt.overload"]) == 0
+    out = capsys.readouterr().out
+    for text in (row.reads, row.cause, row.remedy, "hold", "on re-arm"):
+        assert text in out
+    assert run_app(["explain", "tilt.overload", "--json"]) == 0
+    (told,) = json.loads(capsys.readouterr().out)["faults"]
+    assert told["reaction"] == "hold"
+    assert told["remedy"] == row.remedy
+
+
+def test_explain_lists_all_and_suggests_the_nearest(capsys: Capture) -> None:
+    assert run_app(["explain"]) == 0
+    out = capsys.readouterr().out
+    assert all(key in out for key in CATALOGUE)
+    assert run_app(["explain", "lift_left.overlod"]) == 1
+    assert "Did you mean lift_left.overload?" in capsys.readouterr().err
+
+
+def test_config_check_tells_each_mistake_in_a_line(tmp_path: Path, capsys: Capture) -> None:
+    good, bad = tmp_path / "good.toml", tmp_path / "bad.toml"
+    good.write_text("[rotation]\nmax_deg = 60.0\n")
+    bad.write_text('[rotation]\nmax_dg = 45.0\n[machine]\nlease_s = "soon"\n')
+    assert run_app(["config", "check", str(good)]) == 0
+    assert "valid" in capsys.readouterr().out
+    assert run_app(["config", "check", str(bad)]) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.count("\n") == 2
+    assert "Did you mean rotation.max_deg?" in said.err
+    assert all(line.startswith("graderd: ") for line in said.err.splitlines())
+    assert run_app(["config", "check", str(bad), "--json"]) == 1
+    assert len(json.loads(capsys.readouterr().out)["problems"]) == 2
+    assert run_app(["config", "check", str(tmp_path / "none.toml")]) == 1
+    assert "none.toml" in capsys.readouterr().err
+
+
+def test_config_show_prints_a_file_that_is_valid_again(tmp_path: Path, capsys: Capture) -> None:
+    given, shown = tmp_path / "given.toml", tmp_path / "shown.toml"
+    given.write_text("[machine]\nlease_s = 0.25\n")
+    assert run_app(["config", "show", str(given)]) == 0
+    shown.write_text(capsys.readouterr().out)
+    assert "lease_s = 0.25" in shown.read_text()
+    assert run_app(["config", "check", str(shown)]) == 0
+    capsys.readouterr()
+    assert run_app(["config", "show", str(given), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["machine"]["lease_s"] == 0.25
+
+
+@pytest.mark.parametrize(
+    ("arguments", "module", "handed"),
+    [
+        (["rig", "--dir", "d", "--seed", "1"], "drivers.rig", ["--dir", "d", "--seed", "1"]),
+        (["rig", "dataset", "--out", "x"], "drivers.rig.dataset", ["--out", "x"]),
+        (["rig", "--", "--help"], "drivers.rig", ["--help"]),
+        (["can", "dump", "can0", "--json"], "drivers.electrak.dump", ["can0", "--json"]),
+        (["can", "dump", "--", "--help"], "drivers.electrak.dump", ["--help"]),
+    ],
+)
+def test_hand_overs(monkeypatch: pytest.MonkeyPatch, arguments: list[str], module: str, handed: list[str]) -> None:
+    became: list[list[str]] = []
+    monkeypatch.setattr("graderd.cli.passthrough.os.execv", lambda _, argv: became.append(argv))
+    monkeypatch.setattr("graderd.cli.passthrough.find_spec", lambda _: object())
+    assert run_app(arguments) == 0
+    assert became == [[sys.executable, "-m", module, *handed]]
+
+
+def test_a_program_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.setattr("graderd.cli.passthrough.find_spec", lambda _: None)
+    assert run_app(["rig"]) == 1
+    assert "does not contain it" in capsys.readouterr().err
+
+
+def test_run_demo_and_guard_give_the_daemons_exit_status(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    calls: list[tuple[Any, ...]] = []
+
+    def fake(name: str, status: int) -> Any:
+        def called(*arguments: Any) -> int:
+            calls.append((name, *arguments))
+            return status
+
+        return called
+
+    monkeypatch.setattr("graderd.runtime.app.run_daemon", fake("daemon", 1))
+    monkeypatch.setattr("graderd.runtime.app.run_demo", fake("demo", 0))
+    monkeypatch.setattr("graderd.runtime.app.run_guard", fake("guard", 1))
+    assert run_app(["run", "--config", "c.toml", "--rig-dir", "r", "--json"]) == 1
+    assert run_app(["demo"]) == 0
+    assert run_app(["guard", "--config", "c.toml", "--json"]) == 1
+    assert calls == [
+        ("daemon", Path("c.toml"), False, Path("r"), True),
+        ("demo", False),
+        ("guard", Path("c.toml")),
+    ]
+    assert json.loads(capsys.readouterr().out) == {"safe": False}
+    assert run_app(["run", "--sim", "--rig-dir", "r"]) == 2
+
+
+async def test_services_of_the_servo_want_consent(tmp_path: Path, capsys: Capture) -> None:
+    async with serving(tmp_path) as (_, path):
+        assert await cli(path, "rotation", "reboot") == 2
+        assert "Repeat with --yes" in capsys.readouterr().err
+        assert await cli(path, "rotation", "reboot", "--yes", "--json") == 0
+        assert json.loads(capsys.readouterr().out) == {"rebooted": True}
+        assert await cli(path, "rotation", "step", "--yes") == 1
+        assert "rotation.step_response" in capsys.readouterr().err
+        assert await cli(path, "profile", "verify", "rotation") == 0
+        assert "as its profile says" in capsys.readouterr().out
+
+
+def test_the_module_and_the_command_are_the_same(tmp_path: Path) -> None:
+    run = subprocess.run(
+        [sys.executable, "-m", "graderd.cli", "--socket", str(tmp_path / "none"), "stop", "--json"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert run.returncode == 3
+    assert json.loads(run.stdout)["error"] == "no daemon serves this socket"
+    assert run.stderr.count("\n") == 1
+
+
+def test_stop_does_not_wait_for_large_imports() -> None:
+    code = (
+        "import sys, graderd.cli.app as app; app.run_app(['--socket', 'none', 'stop']);"
+        "sys.exit(any(name in sys.modules for name in ('cv2', 'numpy.linalg', 'fastapi', 'httpx', 'rich.console')))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False)
+    assert run.returncode == 0, run.stderr
