@@ -91,7 +91,7 @@ def soil_palette(look: Look) -> Image8:
 
 def ground_palette(look: Look) -> Image8:
     """Colours of the bed's floor and sides by lightness."""
-    return palette(_GROUND_RGB[look.ground], 0.9, 0.2)
+    return palette(_GROUND_RGB[look.ground], {"plywood": 0.9, "earth": 0.6, "concrete": 0.3}[look.ground], 0.2)
 
 
 def blade_paint(rng: np.random.Generator, material: BladeMaterial) -> Image32:

@@ -111,8 +111,6 @@ class Renderer:
         self._rng = np.random.default_rng(seed + 1)
         self._color = _Stream(COLOR_INTRINSICS.scaled(*color_size), color_pose)
         self._depth = _Stream(DEPTH_INTRINSICS.scaled(*depth_size), depth_pose) if depth_size else None
-        self._stereo = StereoNoise(self._rng)
-        self._grey_noise = self._rng.standard_normal((701, 1511), np.float32)
 
     @property
     def color_intrinsics(self) -> Intrinsics:
@@ -329,12 +327,13 @@ class Renderer:
         return picture.astype(np.uint8, copy=False)
 
     def _noise_tile(self, height: int, width: int) -> Image32:
-        """A new cut out of one large noise field, mirrored where the picture is larger."""
-        shift_y = int(self._rng.integers(0, self._grey_noise.shape[0]))
-        shift_x = int(self._rng.integers(0, self._grey_noise.shape[1]))
-        rows = (np.arange(height) + shift_y) % self._grey_noise.shape[0]
-        first = min(shift_x, self._grey_noise.shape[1] - width)
-        return self._grey_noise[rows, first : first + width]
+        """A new cut out of one large noise field."""
+        field = self.materials.grey_noise
+        shift_y = int(self._rng.integers(0, field.shape[0]))
+        shift_x = int(self._rng.integers(0, field.shape[1]))
+        rows = (np.arange(height) + shift_y) % field.shape[0]
+        columns = (np.arange(width) + shift_x) % field.shape[1]
+        return np.asarray(field.take(rows, axis=0).take(columns, axis=1))
 
     # -- depth ------------------------------------------------------------------------------------------------------
 
@@ -355,11 +354,13 @@ class Renderer:
     def _render_depth(self, state: SceneState, look: Look, ground: _GroundMap) -> DepthImage:
         assert self._depth is not None
         depth = self._true_depth(state, ground)
-        return self._stereo.measure(depth, self._depth.intrinsics.fx, look.disparity_noise_px, look.hole_share)
+        return self.materials.stereo.measure(
+            depth, self._depth.intrinsics.fx, look.disparity_noise_px, look.hole_share, self._rng
+        )
 
 
 class Materials:
-    """The textures of one seed, made once and shared by renderers."""
+    """The textures and noise fields of one seed, made once and shared by renderers."""
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
@@ -369,6 +370,8 @@ class Materials:
         self._wood = wood_grain(rng, shape)
         coarse = cv2.resize(self._grain, (BED_CELLS[1], BED_CELLS[0]), interpolation=cv2.INTER_AREA)
         self._rough: Image32 = (np.asarray(coarse, np.float32) - 128.0) * np.float32(0.0035 / 30.0)
+        self.grey_noise: Image32 = rng.standard_normal((701, 1511), np.float32)
+        self.stereo = StereoNoise(rng)
         self._blades: dict[str, Image32] = {}
 
     def rough(self, first_row: int, shape: tuple[int, ...]) -> Image32:

@@ -18,10 +18,9 @@ _EDGE_STEP_PX = 0.9
 
 
 class StereoNoise:
-    """Turns true depth into measured depth; draws from the generator it is given."""
+    """Turns true depth into measured depth. Its fields of noise and holes are made once and cut anew for each frame."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self._rng = rng
         shape = (613, 1103)
         white = rng.standard_normal(shape, np.float32)
         smooth = np.asarray(cv2.GaussianBlur(white, (0, 0), 1.2), np.float32)
@@ -32,11 +31,13 @@ class StereoNoise:
         ranks = np.argsort(np.argsort(blobs, axis=None)).reshape(shape)
         self._blobs = np.asarray(ranks / blobs.size, np.float32)
 
-    def measure(self, depth_m: Image32, fx: float, noise_px: float, hole_share: float) -> DepthImage:
+    def measure(
+        self, depth_m: Image32, fx: float, noise_px: float, hole_share: float, rng: np.random.Generator
+    ) -> DepthImage:
         """Depth as the camera gives it: uint16 millimetres along the optical axis, 0 = no value.
 
         ``depth_m``: true optical depth; ``fx``: focal length in pixels; ``noise_px``: standard deviation of the
-        disparity; ``hole_share``: share of pixels lost in blobs, besides those lost at edges.
+        disparity; ``hole_share``: share of pixels lost in blobs, besides those lost at edges; ``rng`` says which cut.
         """
         height, width = depth_m.shape
         disparity = np.float32(fx * BASELINE_M) / depth_m
@@ -44,16 +45,17 @@ class StereoNoise:
         jump = np.asarray(cv2.dilate(disparity, kernel)) - np.asarray(cv2.erode(disparity, kernel))
         lost = jump > _EDGE_STEP_PX * 4.0
         if hole_share > 0.0:
-            lost |= self._cut(self._blobs, height, width) < hole_share
+            lost |= _cut(self._blobs, height, width, rng) < hole_share
         if noise_px > 0.0:
-            disparity += self._cut(self._noise, height, width) * np.float32(noise_px)
+            disparity += _cut(self._noise, height, width, rng) * np.float32(noise_px)
         measured = np.float32(fx * BASELINE_M * 1000.0) / np.maximum(disparity, np.float32(0.5))
         lost |= (measured < MIN_DEPTH_M * 1000.0) | (measured > MAX_DEPTH_M * 1000.0)
         result = np.asarray(measured + np.float32(0.5), np.uint16)
         result[lost] = 0
         return result
 
-    def _cut(self, field: Image32, height: int, width: int) -> Image32:
-        rows = (np.arange(height) + int(self._rng.integers(0, field.shape[0]))) % field.shape[0]
-        columns = (np.arange(width) + int(self._rng.integers(0, field.shape[1]))) % field.shape[1]
-        return np.asarray(field.take(rows, axis=0).take(columns, axis=1))
+
+def _cut(field: Image32, height: int, width: int, rng: np.random.Generator) -> Image32:
+    rows = (np.arange(height) + int(rng.integers(0, field.shape[0]))) % field.shape[0]
+    columns = (np.arange(width) + int(rng.integers(0, field.shape[1]))) % field.shape[1]
+    return np.asarray(field.take(rows, axis=0).take(columns, axis=1))
