@@ -51,7 +51,6 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
 def run_simulated(main: Callable[[SimulatedLoop], Coroutine[Any, Any, T]]) -> T:
     """Run ``main(loop)`` to its end in simulated time; a task it leaves behind is an error."""
     loop = SimulatedLoop()
-    asyncio.set_event_loop(loop)
     try:
         result = loop.run_until_complete(main(loop))
         left = [task.get_name() for task in asyncio.all_tasks(loop)]
@@ -59,7 +58,6 @@ def run_simulated(main: Callable[[SimulatedLoop], Coroutine[Any, Any, T]]) -> T:
         return result
     finally:
         loop.run_until_complete(loop.shutdown_asyncgens())
-        asyncio.set_event_loop(None)
         loop.close()
 
 

@@ -14,7 +14,7 @@ from typing import Final
 import cantools.database
 from cantools.database.can import Database, Message
 
-from drivers.electrak.profile import read_resource
+from drivers.electrak.profile import read_layout
 from graderd.hal.errors import ProtocolError
 
 FACTORY_FILL: Final = 0
@@ -55,7 +55,7 @@ class Feedback:
 @functools.cache
 def load_database(layout: str) -> Database:
     """The DBC file of a layout as a cantools database."""
-    database = cantools.database.load_string(read_resource(f"{layout}.dbc"), database_format="dbc")
+    database = cantools.database.load_string(read_layout(layout), database_format="dbc")
     if not isinstance(database, Database):
         raise TypeError(f"{layout}.dbc is no CAN database")
     return database

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import functools
-import tomllib
 from dataclasses import dataclass, fields
 from importlib import resources
 from typing import Any
 
+import firmware_profiles
 from graderd.hal.errors import WrongDeviceError
 
 
@@ -79,20 +79,16 @@ class ActuatorProfile:
     sources: dict[str, str]
 
 
-def read_resource(file_name: str) -> str:
-    """Text of a file in the ``firmware_profiles`` package.
+def read_layout(layout: str) -> str:
+    """Text of ``firmware_profiles/<layout>.dbc``.
 
     Raises:
-        WrongDeviceError: no such file; the message lists the profiles there are.
+        WrongDeviceError: no such file.
     """
-    folder = resources.files("firmware_profiles")
     try:
-        return (folder / file_name).read_text(encoding="utf-8")
+        return (resources.files(firmware_profiles) / f"{layout}.dbc").read_text(encoding="utf-8")
     except FileNotFoundError:
-        known = sorted(p.name for p in folder.iterdir() if p.name.startswith("electrak_"))
-        raise WrongDeviceError(
-            f"firmware profile {file_name}", "does not exist", f"Known files: {', '.join(known)}"
-        ) from None
+        raise WrongDeviceError(f"message layout {layout}", "firmware_profiles has no such DBC file") from None
 
 
 @functools.cache
@@ -102,11 +98,14 @@ def load_profile(name: str) -> ActuatorProfile:
     Raises:
         WrongDeviceError: no such profile, or it lacks a figure or has one that is not known.
     """
-    raw: dict[str, Any] = tomllib.loads(read_resource(f"{name}.toml"))
+    try:
+        raw: dict[str, Any] = firmware_profiles.load(name)
+    except firmware_profiles.UnknownProfileError as error:
+        raise WrongDeviceError(f"profile {name}", str(error)) from error
     figures: dict[str, dict[str, Any]] = raw.get("figures", {})
     wanted = {f.name for f in fields(Figures)}
-    if missing := sorted(wanted - figures.keys()) + sorted(figures.keys() - wanted):
-        raise WrongDeviceError(f"firmware profile {name}", f"figures missing or not known: {', '.join(missing)}")
+    if odd := sorted(wanted ^ figures.keys()):
+        raise WrongDeviceError(f"profile {name}", f"figures missing or not known: {', '.join(odd)}")
     return ActuatorProfile(
         name=raw["name"],
         model=raw["model"],
