@@ -8,20 +8,26 @@ the noise add up to litres.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from graderd.core.blade import BladeGeometry
 from graderd.hal.camera import DepthImage
 from graderd.perception.decide import Verdict, decide
-from graderd.perception.geometry import F32, F64, View
+from graderd.perception.geometry import F32, F64, U8, View, third_outlines_px
 from graderd.perception.registration import BladeFinder, BladeFix, Ground, GroundFit
 from graderd.perception.settings import DecisionSettings, DepthSettings
 
+I64 = npt.NDArray[np.intp]
+
 NOMINAL_WIDTH_PX = 848
-MAX_SOIL_M = 0.45
-"""What stands higher than this above the ground is machine, not soil."""
+KEPT_GRIDS_N = 64
+THIN_KERNEL = np.ones((5, 5), dtype=np.uint8)
+THIN_TOLERANCE_M = 0.04
 FACE_MARGIN_M = 0.025
 """Points closer to the blade's face than this are the face."""
 
@@ -30,7 +36,8 @@ FACE_MARGIN_M = 0.025
 class HeightMap:
     """Soil in blade coordinates: ``height_m[i, j]`` at s cell i (right to left) and d cell j (blade to front).
 
-    ``seen`` is False where the height was filled in. ``valid``: share of cells seen per third (right, center, left).
+    ``seen`` is False where the height was filled in. ``valid``: per third (right, center, left) the share of the pixels
+    on it that measure it, neither without depth nor hidden by something nearer.
     """
 
     height_m: F64
@@ -47,6 +54,8 @@ class DepthJudge:
 
     def __init__(self, view: View, blade: BladeGeometry, settings: DepthSettings, decision: DecisionSettings) -> None:
         self._settings = settings
+        self._view = view
+        self._grids: OrderedDict[int, tuple[U8, tuple[int, ...]]] = OrderedDict()
         self._decision = decision
         self._blade = blade
         self._position = view.position_m.astype(np.float32)
@@ -64,7 +73,7 @@ class DepthJudge:
 
     def height_map(self, depth_mm: DepthImage, angle_deg: float) -> HeightMap:
         """Measure one depth picture (uint16, mm along the optical axis, 0 = no value)."""
-        x, y, z = self._points(depth_mm)
+        pixels, x, y, z = self._points(depth_mm)
         ground = self._ground.fit(x, y, z)
         z = np.asarray(
             z - np.float32(ground.offset_m) - np.float32(ground.slope_x) * x - np.float32(ground.slope_y) * y
@@ -72,7 +81,8 @@ class DepthJudge:
         angle = np.radians(angle_deg)
         cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
         d = x * cos + y * sin - np.float32(self._blade.x_offset_m)
-        near = np.flatnonzero((d > -0.20) & (d < self._blade.reach_m + 0.15) & (z < MAX_SOIL_M))
+        near = np.flatnonzero((d > -0.20) & (d < self._blade.reach_m + 0.15) & (z < self._settings.max_height_m))
+        valid = self._valid_shares(pixels[near], angle_deg)
         x, y, z, d = x[near], y[near], z[near], d[near]
         s = y * cos - x * sin
         setback = self._finder.setback(z)
@@ -82,7 +92,7 @@ class DepthJudge:
         ahead, along = np.float32(fix.ahead_m), np.float32(fix.along_m)
         d = np.asarray(d - ahead + turn * s, dtype=np.float32)
         s = np.asarray(s - along - turn * d, dtype=np.float32)
-        return self._map(s, d, z, setback, ground, fix)
+        return self._map(s, d, z, setback, ground, fix, valid)
 
     def verdict(self, soil: HeightMap) -> Verdict:
         """Judge a height map."""
@@ -95,15 +105,41 @@ class DepthJudge:
             )
         return verdict
 
-    def _points(self, depth_mm: DepthImage) -> tuple[F32, F32, F32]:
+    def _points(self, depth_mm: DepthImage) -> tuple[I64, F32, F32, F32]:
+        """Indices of the sampled pixels that have depth, and their points in the vehicle frame."""
         stride = self._stride
         depth = depth_mm[stride // 2 :: stride, stride // 2 :: stride].ravel()
         valid = np.flatnonzero(depth)
         range_m = depth[valid].astype(np.float32) * np.float32(0.001)
         x, y, z = (ray[valid] * range_m + origin for ray, origin in zip(self._rays, self._position, strict=True))
-        return x, y, z
+        return valid, x, y, z
 
-    def _map(self, s: F32, d: F32, z: F32, setback: F32, ground: Ground, fix: BladeFix) -> HeightMap:
+    def _valid_shares(self, pixels: I64, angle_deg: float) -> tuple[float, float, float]:
+        """Of the pixels on each third, the share among ``pixels``."""
+        step = round(angle_deg)
+        if step not in self._grids:
+            self._grids[step] = self._third_grid(step)
+            if len(self._grids) > KEPT_GRIDS_N:
+                self._grids.popitem(last=False)
+        thirds, totals = self._grids[step]
+        counts = np.bincount(thirds[pixels], minlength=4)
+        shares = [float(counts[third]) / totals[third] if totals[third] else 0.0 for third in range(3)]
+        return shares[0], shares[1], shares[2]
+
+    def _third_grid(self, angle_deg: float) -> tuple[U8, tuple[int, ...]]:
+        """For each sampled pixel the third it lies on (3: none), and how many lie on each."""
+        lens = self._view.lens
+        rows, columns = (len(range(self._stride // 2, side, self._stride)) for side in (lens.height, lens.width))
+        grid = np.full((rows, columns), 3, dtype=np.uint8)
+        for third, outline in enumerate(third_outlines_px(self._view, self._blade, angle_deg)):
+            if np.isfinite(outline).all():
+                places = (outline - self._stride // 2) / self._stride
+                cv2.fillPoly(grid, [np.round(places * 16).astype(np.int32)], third, shift=4)
+        return grid.ravel(), tuple(int(n) for n in np.bincount(grid.ravel(), minlength=4))
+
+    def _map(
+        self, s: F32, d: F32, z: F32, setback: F32, ground: Ground, fix: BladeFix, valid: tuple[float, float, float]
+    ) -> HeightMap:
         blade, settings = self._blade, self._settings
         half = np.float32(blade.length_m / 2)
         front = d > np.maximum(np.float32(FACE_MARGIN_M) - setback, np.float32(0.0))
@@ -118,22 +154,32 @@ class DepthJudge:
         seen = (count > 0).reshape(self._along_n, self._ahead_n)
         height = np.divide(total, count, out=np.zeros(size), where=count > 0).reshape(seen.shape)
         filled = fill_hidden(height, seen, float(np.tan(np.radians(settings.repose_deg))) * self._cell_d_m)
+        filled = without_thin(filled)
         distance = 0.9
         expected = settings.disparity_noise_px * distance**2 / (self._focal_px * settings.baseline_m)
         noise = max(expected, ground.residual_m)
         threshold = max(settings.min_height_m, settings.noise_factor_ratio * noise / 2.0)
         soil = np.where(filled > threshold, filled, 0.0)
         litres = soil.reshape(3, -1).sum(axis=1) * self._cell_s_m * self._cell_d_m * 1000.0
-        valid = seen.reshape(3, -1).mean(axis=1)
         return HeightMap(
             filled,
             seen,
             threshold,
             (float(litres[0]), float(litres[1]), float(litres[2])),
-            (float(valid[0]), float(valid[1]), float(valid[2])),
+            valid,
             ground,
             fix,
         )
+
+
+def without_thin(height: F64) -> F64:
+    """Heights with what is thin taken away: hoses, rods and single stones stand steep, soil does not.
+
+    A morphological opening removes what is narrower than five cells; where it takes away more than a crest at the
+    angle of repose would lose, the opened height is taken.
+    """
+    opened = cv2.morphologyEx(height.astype(np.float32), cv2.MORPH_OPEN, THIN_KERNEL, borderType=cv2.BORDER_REPLICATE)
+    return np.where(height > opened + THIN_TOLERANCE_M, opened, height)
 
 
 def fill_hidden(height: F64, seen: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], drop_per_cell: float) -> F64:

@@ -90,6 +90,7 @@ class DepthSettings(Settings):
         default=4.0, description="soil must stand this many times above the measured noise"
     )
     min_height_m: Positive = Field(default=0.012, description="and at least this high")
+    max_height_m: Positive = Field(default=0.34, description="what stands higher than this is machine, not soil")
     repose_deg: Annotated[float, Field(gt=0, lt=80)] = Field(
         default=33.0, description="slope given to hidden back faces"
     )
