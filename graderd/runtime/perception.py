@@ -64,6 +64,7 @@ class PerceptionWorker:
         self._trouble: Trouble | None = None
         self._last_word_s = clock.now_s()
         self._no_frame_since_s = clock.now_s()
+        self._opened_s = clock.now_s()
         self._restarted_s: float | None = None
         self._killed_hung = False
         self._opens_without_frame_n = 0
@@ -231,13 +232,16 @@ class PerceptionWorker:
             self._opens_without_frame_n = 0
         elif isinstance(message, Opened):
             self._opened, self._trouble = message, None
+            self._opened_s = self._last_word_s
             log.info("camera open: %s", message.description)
         elif isinstance(message, Trouble):
             if self._trouble is None or self._trouble.message != message.message:
                 log.warning("camera: %s", message.message)
             self._trouble = message
-            # Alive but without frames for too long: the ladder goes on all the same.
-            return self._clock.now_s() - self._no_frame_since_s < self._camera.restart_s
+            # Alive but without frames for too long: the ladder goes on all the same. The time a child took to start
+            # does not count against it, or none that starts slowly would ever get to its first frame.
+            waiting_s = self._clock.now_s() - max(self._no_frame_since_s, self._opened_s)
+            return not message.final and waiting_s < self._camera.restart_s
         elif self._preview is not None and not self._preview.done():
             self._preview.set_result(base64.b64decode(message.jpeg_base64))
         return True
