@@ -17,6 +17,14 @@ from graderd.hal.errors import DeviceMissingError
 
 READY_TIMEOUT_S = 30.0
 RESTART_PAUSE_S = 1.0
+RIG_STREAMS = {
+    "color_width_px": 640,
+    "color_height_px": 400,
+    "depth_width_px": 424,
+    "depth_height_px": 240,
+    "rate_hz": 15.0,
+}
+"""What the rig renders in time on one core beside everything else."""
 
 log = logging.getLogger(__name__)
 
@@ -96,7 +104,7 @@ def attach(config: Config, directory: Path) -> Config:
         raise DeviceMissingError(
             str(path), f"no rig is ready there ({error})", "Start one: graderd rig --dir DIR"
         ) from None
-    camera = {"source": "rig", "path": rig["camera"]}
+    camera = {"source": "rig", "path": rig["camera"], **RIG_STREAMS}
     changes = {
         "simulated": True,
         "camera": config.camera.model_copy(update=camera),
