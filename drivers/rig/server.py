@@ -433,6 +433,11 @@ class Rig:
             "load_force_n": load.force_n,
             "load_torque_nm": load.torque_nm,
             "servo_torque_enabled": self.servo.torque_enabled,
+            "servo_watchdog_tripped": self.servo.tripped,
+            "servo_requests_n": self.servo_bus.requests_n,
+            "lift_left_enabled": self.lift_left.motion_enabled,
+            "lift_right_enabled": self.lift_right.motion_enabled,
+            "tilt_enabled": self.tilt.motion_enabled,
             "camera_pid": self._camera.pid if self._camera else 0,
         }
 

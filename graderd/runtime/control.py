@@ -29,6 +29,10 @@ from graderd.runtime.state_file import StateFile
 
 MAX_COMMANDS_PER_TICK = 32
 LATENESS_WINDOW_N = 500
+BLOCKED_S = 0.5
+"""A tick this late: goals have timed out and the servo's watchdog (0.2 s by default) has tripped meanwhile."""
+OVERRUN_SHOWN_S = 1.0
+LAPSE_SHOWN_S = 3.0
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +86,8 @@ class ControlLoop:
         self._queue: deque[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = deque()
         self._wake = asyncio.Event()
         self._moving: set[str] = set()
-        self._late_since_s: float | None = None
+        self._late: tuple[float, float] | None = None
+        self._lapse: tuple[str, float] | None = None
         self._hold_failed: tuple[str, ...] = ()
 
     # ---- commands -------------------------------------------------------------------------------------------------
@@ -115,7 +120,7 @@ class ControlLoop:
                 self.lateness_s.append(max(0.0, late_s))
                 if late_s > self.config.control.overrun_s:
                     self.overruns_n += 1
-                    self._late_since_s = self._clock.now_s()
+                    self._note_late(late_s, self._clock.now_s())
                 self.tick()
                 due_s = max(due_s + period_s, self._clock.now_s())
                 await asyncio.sleep(max(0.0, due_s - self._clock.now_s()))
@@ -162,6 +167,7 @@ class ControlLoop:
         )
         self.state, self.intents = result.state, result.intents
         self._note_transition(before, result.state)
+        self._note_lapse(before, result.state, now_s)
         self._act(dt_s, pose)
         replies: list[cmd.Reply] = [result.replies[0]] * len(commands) if commands else []
         for position, index in enumerate(order):
@@ -249,9 +255,12 @@ class ControlLoop:
             found.extend(device.faults())
         for source in self.extra_faults:
             found.extend(source(now_s))
-        if self._late_since_s is not None and now_s - self._late_since_s < 1.0:
-            detail = f"tick {max(self.lateness_s) * 1e3:.0f} ms late, {self.overruns_n} overruns"
-            found.append(DeviceFault("daemon", "tick_overrun", detail, self._late_since_s))
+        if self._late is not None and now_s - self._late[1] < OVERRUN_SHOWN_S:
+            late_s, at_s = self._late
+            detail = f"tick {late_s * 1e3:.0f} ms late, {self.overruns_n} overruns"
+            found.append(DeviceFault("daemon", "loop_blocked" if late_s > BLOCKED_S else "tick_overrun", detail, at_s))
+        if self._lapse is not None and now_s - self._lapse[1] < LAPSE_SHOWN_S:
+            found.append(DeviceFault("daemon", "lease_lapsed", f"client {self._lapse[0] or '?'}", self._lapse[1]))
         if self._state_file.problem:
             found.append(DeviceFault("daemon", "state_file_corrupt", self._state_file.problem, now_s))
         return found
@@ -266,6 +275,16 @@ class ControlLoop:
             self.last_stop = self._state_file.save(after.reason)
         elif after.mode in ARMED and before.mode not in ARMED:
             self._gate = GateState()
+
+    def _note_late(self, late_s: float, now_s: float) -> None:
+        """The worst of the last moments is told: small delays after a long one must not hide it."""
+        if self._late is None or late_s >= self._late[0] or now_s - self._late[1] > OVERRUN_SHOWN_S:
+            self._late = (late_s, now_s)
+
+    def _note_lapse(self, before: State, after: State, now_s: float) -> None:
+        lapsed = before.lease is not None and after.lease is None and now_s > before.lease.expires_s
+        if lapsed and before.lease is not None and after.mode in ARMED:
+            self._lapse = (before.lease.client, now_s)
 
     def _clear_latches(self, commands: tuple[cmd.Command, ...]) -> None:
         """A reset or an arm lets go of latched faults whose cause is gone; what is still there stays and refuses."""

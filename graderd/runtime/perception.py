@@ -13,7 +13,7 @@ import logging
 import sys
 from collections import deque
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from graderd.core.blade import BladeGeometry
 from graderd.core.status import CameraStatus
@@ -31,6 +31,8 @@ START_GRACE_S = 15.0
 RESET_BEFORE_OPEN_N = 3
 BACK_OFF_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 RESTART_SHOWN_S = 5.0
+FUTURE_S = 0.1
+"""Both processes read one clock; a frame further ahead of it than this is none."""
 MAX_LINE_BYTES = 8 * 1024 * 1024
 MAX_UNSENT_BYTES = 64 * 1024
 
@@ -67,6 +69,7 @@ class PerceptionWorker:
         self._opened_s = clock.now_s()
         self._restarted_s: float | None = None
         self._killed_hung = False
+        self._nonsense: tuple[str, float] | None = None
         self._opens_without_frame_n = 0
         self._restarts_n = 0
         self._frame_times: deque[float] = deque(maxlen=30)
@@ -129,6 +132,8 @@ class PerceptionWorker:
         if self._restarted_s is not None and now_s - self._restarted_s < RESTART_SHOWN_S:
             condition = "worker_hung" if self._killed_hung else "worker_restarted"
             found.append(DeviceFault("camera", condition, f"restart {self._restarts_n}", self._restarted_s))
+        if self._nonsense is not None and now_s - self._nonsense[1] < RESTART_SHOWN_S:
+            found.append(DeviceFault("daemon", "perception_nonsense", *self._nonsense))
         if self._opened is not None and self._opened.not_kept:
             found.append(
                 DeviceFault("camera", "settings_not_kept", "; ".join(self._opened.not_kept), self._last_word_s)
@@ -217,15 +222,20 @@ class PerceptionWorker:
             return False
         try:
             message = FromChild.validate_json(line)
-        except ValidationError:
-            log.warning("perception worker sent something else than its protocol: killing it")
+            self._last_word_s = self._clock.now_s()
+            return self._take(message)
+        except ValueError as error:  # pydantic's ValidationError is one
+            detail = str(error).splitlines()[0]
+            self._nonsense = (detail, self._clock.now_s())
+            log.warning("perception worker sent what cannot be true (%s): killing it", detail)
             return False
-        self._last_word_s = self._clock.now_s()
-        return self._take(message)
 
     def _take(self, message: Opened | Observed | Trouble | Preview) -> bool:
         if isinstance(message, Observed):
-            self._newest, self._taken = message.unpack(), False
+            observation = message.unpack()
+            if observation.capture_s > self._last_word_s + FUTURE_S:
+                raise ValueError(f"a frame of {observation.capture_s - self._last_word_s:.2f} s in the future")
+            self._newest, self._taken = observation, False
             self._no_frame_since_s = self._last_word_s
             self._frame_times.append(self._newest.capture_s)
             self._trouble = None

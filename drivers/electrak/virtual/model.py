@@ -162,6 +162,11 @@ class VirtualElectrak:
         """Whether the overload latch is set."""
         return self._motion.overload
 
+    @property
+    def motion_enabled(self) -> bool:
+        """Whether the last control message that counted allows motion."""
+        return self._motion.enabled
+
     def cut_power(self) -> None:
         """Take the supply away: motion ends, the holding brake keeps the tube, everything volatile is forgotten."""
         self._powered = False
