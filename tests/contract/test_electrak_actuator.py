@@ -1,0 +1,243 @@
+"""Conformance suite of the linear actuator contract, over every wire there is: in process, slcan pty, vcan.
+
+Where this kernel has no vcan interface, the vcan variant is not collected (see the test ids).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import can
+import pytest
+
+from drivers.electrak import CanLink, ElectrakActuator
+from drivers.electrak.ports import BusPort
+from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
+from graderd.hal.clock import SystemClock
+from graderd.hal.errors import (
+    CommandRangeError,
+    DeviceMissingError,
+    DeviceRefusedError,
+    DeviceTimeoutError,
+    LifecycleError,
+    StaleReadingError,
+)
+from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.linear_actuator import LinearActuator
+from graderd.hal.settings import ActuatorSettings, CanSettings
+
+VCAN = next((path.name for path in sorted(Path("/sys/class/net").glob("vcan*"))), None)
+WIRES = ["in_process", "python_can_virtual", "slcan_pty", *([VCAN] if VCAN else [])]
+
+
+class Bench:
+    """One virtual actuator, the link and the driver under test."""
+
+    def __init__(self, wire: str, tmp_path: Path) -> None:
+        self.clock = SystemClock()
+        self.unit = VirtualElectrak(position_mm=100.0, seed=5)
+        self.external: can.BusABC | None = None
+        self.bus: VirtualActuatorBus
+        link: Path | None = None
+        factory = None
+        settings = CanSettings(interface="virtual", channel=str(tmp_path))
+        if wire == "slcan_pty":
+            link = tmp_path / "can"
+            settings = CanSettings(interface="slcan", channel=str(link))
+        elif wire == "in_process":
+            factory = lambda: BusPort(self.bus.connect())  # noqa: E731  (bound late: the bus is made below)
+        elif wire != "python_can_virtual":
+            settings = CanSettings(interface="socketcan", channel=wire)
+            self.external = can.Bus(interface="socketcan", channel=wire)
+        self.bus = VirtualActuatorBus([self.unit], link=link, bus=self.external)
+        self.link = CanLink(settings, self.clock, bus_factory=factory)
+        self.axis = ElectrakActuator("lift_left", ActuatorSettings(address_n=19), self.link, self.clock)
+        self._relay: asyncio.Task[None] | None = None
+        self._relay_bus = (
+            can.Bus(interface="virtual", channel=settings.channel) if wire == "python_can_virtual" else None
+        )
+
+    async def start(self) -> None:
+        await self.bus.start()
+        if self._relay_bus is not None:
+            self._relay = asyncio.create_task(self._carry(self._relay_bus), name="relay")
+
+    async def _carry(self, outside: can.BusABC) -> None:
+        """python-can's virtual bus has no file descriptor: the machine's side of it is polled here."""
+        inside = self.bus.connect()
+        while True:
+            for source, sink in ((outside, inside), (inside, outside)):
+                while (message := source.recv(0)) is not None:
+                    sink.send(message)
+            await asyncio.sleep(0.002)
+
+    async def stop(self) -> None:
+        await self.axis.close()
+        await self.link.close()
+        if self._relay is not None:
+            self._relay.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._relay
+        await self.bus.close()
+        for bus in (self._relay_bus, self.external):
+            if bus is not None:
+                bus.shutdown()
+
+    async def renew(self, target_mm: float, seconds: float, share: float = 1.0) -> None:
+        for _ in range(round(seconds / 0.02)):
+            self.axis.set_target_mm(target_mm, share)
+            await asyncio.sleep(0.02)
+
+
+def state(axis: LinearActuator) -> Lifecycle:
+    """A call, so that the type checker does not take the state for a constant."""
+    return axis.lifecycle
+
+
+@pytest.fixture(params=WIRES)
+async def bench(request: pytest.FixtureRequest, tmp_path: Path) -> AsyncIterator[Bench]:
+    made = Bench(request.param, tmp_path)
+    await made.start()
+    yield made
+    await made.stop()
+
+
+async def test_life_from_closed_to_motion_and_back(bench: Bench) -> None:
+    """One long walk, since every wire needs its own real time."""
+    axis: LinearActuator = bench.axis
+    now_s = bench.clock.now_s
+    assert state(axis) is Lifecycle.CLOSED
+    assert axis.telemetry().position_mm is None
+    with pytest.raises(LifecycleError, match="Open it first"):
+        await axis.arm()
+    with pytest.raises(LifecycleError):
+        axis.set_target_mm(120.0)
+    axis.hold()  # allowed in every state
+
+    await axis.open()
+    assert state(axis) is Lifecycle.STANDBY
+    assert axis.faults() == ()
+    position = axis.telemetry().position_mm
+    assert position is not None
+    assert position.fresh(now_s(), 0.3) == pytest.approx(100.0, abs=0.2)
+    with pytest.raises(LifecycleError, match="Arm it first"):
+        axis.set_target_mm(120.0)
+    with pytest.raises(LifecycleError):
+        await axis.open()
+
+    await axis.arm()
+    assert state(axis) is Lifecycle.ACTIVE
+    await asyncio.sleep(0.25)
+    assert bench.unit.position_mm == 100.0, "nothing moves until a target is set"
+    for bad in (4.9, 295.1, math.nan, math.inf, -math.inf):
+        with pytest.raises(CommandRangeError):
+            axis.set_target_mm(bad)
+    for share in (0.0, -0.1, 1.01, math.nan):
+        with pytest.raises(CommandRangeError):
+            axis.set_target_mm(120.0, share)
+
+    await bench.renew(125.0, 1.6)
+    assert bench.unit.position_mm == pytest.approx(125.0, abs=0.9)
+    telemetry = axis.telemetry()
+    assert telemetry.target_sent_mm is not None
+    assert telemetry.current_a is not None
+    assert telemetry.counters["feedback_n"] > 10
+    assert 0.0 <= telemetry.thermal_load < 0.1
+    with pytest.raises(StaleReadingError):
+        telemetry.current_a.fresh(now_s() + 5.0, 0.3)
+
+    await bench.renew(200.0, 0.6)  # under way
+    axis.hold()
+    await asyncio.sleep(0.25)
+    stood_mm = bench.unit.position_mm
+    assert 127.0 < stood_mm < 170.0
+    await asyncio.sleep(0.3)
+    assert bench.unit.position_mm == stood_mm, "hold stays until a new target"
+    await bench.renew(stood_mm + 12.0, 0.4)
+    await axis.disarm()
+    assert state(axis) is Lifecycle.STANDBY
+    await asyncio.sleep(0.25)
+    stood_mm = bench.unit.position_mm
+    await asyncio.sleep(0.25)
+    assert bench.unit.position_mm == stood_mm
+    assert axis.telemetry().moving is not None
+
+    await axis.close()
+    await axis.close()
+    assert state(axis) is Lifecycle.CLOSED
+    assert not bench.unit.received_control[-1].motion_enable
+    await axis.open()
+    assert state(axis) is Lifecycle.STANDBY
+
+
+async def test_a_target_that_is_not_renewed_becomes_a_hold(bench: Bench) -> None:
+    axis = bench.axis
+    await axis.open()
+    await axis.arm()
+    axis.set_target_mm(250.0)
+    await asyncio.sleep(1.2)
+    stood_mm = bench.unit.position_mm
+    assert 100.0 < stood_mm < 135.0
+    assert state(axis) is Lifecycle.ACTIVE
+    assert axis.telemetry().counters["target_timeouts_n"] == 1
+    assert bench.unit.velocity_mm_per_s == 0.0
+
+
+async def test_silence_fails_the_axis_and_it_comes_back_to_standby_only(bench: Bench) -> None:
+    axis = bench.axis
+    await axis.open()
+    await axis.arm()
+    bench.bus.inject("silence")
+    await asyncio.sleep(0.6)
+    assert state(axis) is Lifecycle.FAILED
+    assert [fault.condition for fault in axis.faults()] == ["no_feedback"]
+    with pytest.raises(LifecycleError):
+        await axis.arm()
+    bench.bus.clear_faults()
+    await asyncio.sleep(0.6)
+    assert state(axis) is Lifecycle.STANDBY
+    assert axis.faults() == ()
+    await axis.arm()
+
+
+async def test_no_answer_is_a_timeout_that_says_what_to_look_at(bench: Bench) -> None:
+    bench.unit.cut_power()
+    with pytest.raises(DeviceTimeoutError, match="no feedback from address 19"):
+        await bench.axis.open()
+    assert state(bench.axis) is Lifecycle.CLOSED
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        (CanSettings(interface="slcan", channel="/nowhere/can"), "cannot be opened"),
+        (CanSettings(interface="socketcan", channel="can_absent"), "no such network interface"),
+    ],
+)
+async def test_a_channel_that_does_not_exist_is_said_at_once(settings: CanSettings, why: str) -> None:
+    link = CanLink(settings)
+    axis = ElectrakActuator("tilt", ActuatorSettings(), link)
+    with pytest.raises(DeviceMissingError, match=why):
+        await axis.open()
+    assert state(axis) is Lifecycle.CLOSED
+    await axis.close()
+    await link.close()
+
+
+async def test_settings_beyond_the_model_are_refused(tmp_path: Path) -> None:
+    link = CanLink(CanSettings(interface="virtual", channel=str(tmp_path)))
+    with pytest.raises(CommandRangeError, match="beyond the stroke of 100"):
+        ElectrakActuator("tilt", ActuatorSettings(profile="electrak_md_a050"), link)
+
+
+async def test_a_fault_present_forbids_arming(bench: Bench) -> None:
+    await bench.axis.open()
+    bench.bus.inject("fatal")
+    await asyncio.sleep(0.3)
+    with pytest.raises(DeviceRefusedError, match="fatal"):
+        await bench.axis.arm()
+    assert state(bench.axis) is Lifecycle.STANDBY
