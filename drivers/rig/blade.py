@@ -30,6 +30,8 @@ TILT_DEG_PER_MM = 0.30
 STEEL_FRICTION = 0.37
 """Soil on steel, static (Table 2 of the paper)."""
 _SLOW_M_PER_S = 1e-4
+_SPREAD = ((np.arange(10) + 0.5) / 10.0)[:, None]
+"""Where along the heap's slope the parts of a column of carried soil come to lie: 0 at the face, 1 at the foot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +87,10 @@ class Plough:
     """Moves soil as the blade moves through the field.
 
     Each sub-step is shorter than half a cell. Soil that the body of the blade now covers, above the cutting edge, is
-    carried out on the side the blade moves to, along the direction a rough plate drives soil: square to the face,
-    dragged sideways by the plate's own sideways motion as far as friction holds (soil on steel, 0.37). A blade
-    turned by more than the friction angle (20 degrees) therefore casts soil towards its trailing end. Then the
-    neighbourhood slides to the angle of repose, the blade being a wall up to its top edge.
+    carried out on the side the blade moves to and laid on the slope of the heap there. It goes where a rough plate
+    drives it: square to the face, dragged sideways by the plate's own sideways motion as far as friction holds (soil
+    on steel, 0.37). A blade turned by more than the friction angle (20 degrees) therefore casts soil towards its
+    trailing end. Then the neighbourhood slides to the angle of repose, the blade being a wall up to its top edge.
     """
 
     def __init__(self, field: SoilField, passes: int = 3) -> None:
@@ -184,11 +186,19 @@ class Plough:
         view[body.wall.mask] -= np.where(loaded, excess, 0.0)
         clear_m = 1.45 * self._field.cell_m
         """Beyond sqrt(2) cells none of the four cells that receive a column belongs to the body."""
-        d_to = np.where(forward, clear_m, -self._thickness_m - clear_m)[loaded]
+        carried = excess[loaded]
+        # A heap that moves on as a whole rises by the same amount all along its slope: so is the soil spread.
+        spread_m = carried / self._field.repose_slope * _SPREAD
+        beyond = np.where(forward[loaded], 0.0, -1.0) * self._thickness_m
+        outwards = np.where(forward[loaded], 1.0, -1.0)
+        d_to = beyond + outwards * (clear_m + spread_m)
         s_to = body.s_m[loaded] + drag[loaded] * np.abs(d_to - body.d_m[loaded])
         angle = math.radians(pose.angle_deg)
         cos, sin = math.cos(angle), math.sin(angle)
-        self._field.deposit(window, x_m + d_to * cos - s_to * sin, d_to * sin + s_to * cos, excess[loaded])
+        columns = np.broadcast_to(carried / _SPREAD.size, d_to.shape)
+        self._field.deposit(
+            window, (x_m + d_to * cos - s_to * sin).ravel(), (d_to * sin + s_to * cos).ravel(), columns.ravel()
+        )
 
 
 def blade_grid(field: SoilField, window: Window, x_m: float, angle_deg: float) -> tuple[FloatArray, FloatArray]:

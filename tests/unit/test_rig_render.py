@@ -1,0 +1,269 @@
+"""The rig's pictures: geometry against pencil and paper, left and right, noise, repeatability."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from drivers.rig.blade import BladePose, Plough
+from drivers.rig.look import Look
+from drivers.rig.optics import (
+    COLOR_INTRINSICS,
+    COLOR_POSE,
+    DEPTH_INTRINSICS,
+    DEPTH_POSE,
+    MAX_DEPTH_M,
+    MIN_DEPTH_M,
+    camera_json,
+    knocked,
+)
+from drivers.rig.piles import SceneZone, lay_scene
+from drivers.rig.renderer import Materials, Renderer, SceneState
+from drivers.rig.shapes import Solid
+from drivers.rig.soil import SoilField
+from drivers.rig.surface import Rays, SurfaceSweep
+from graderd.hal.camera import Intrinsics, StreamPose
+
+COLOR_SIZE, DEPTH_SIZE = (320, 200), (424, 240)
+
+
+@pytest.fixture(scope="module")
+def materials() -> Materials:
+    return Materials(0)
+
+
+def state_of(field: SoilField, x_m: float = 3.0, blade: BladePose | None = None, *props: Solid) -> SceneState:
+    return SceneState(field.heights_m.astype(np.float32), field.cell_m, x_m, blade or BladePose(), props)
+
+
+def points_m(depth_m: npt.NDArray[np.float32], lens: Intrinsics, pose: StreamPose) -> npt.NDArray[np.float64]:
+    """Vehicle-frame points of a depth picture, ``(height, width, 3)``: written out here, apart from the renderer."""
+    v, u = np.mgrid[0 : lens.height, 0 : lens.width].astype(np.float64)
+    optical = np.stack(((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, np.ones_like(u)), axis=-1)
+    return np.asarray((optical * depth_m[..., None]) @ np.array(pose.rotation).T + np.array(pose.position_m))
+
+
+def test_rig_ranges_of_planes_are_exact() -> None:
+    lens = DEPTH_INTRINSICS.scaled(*DEPTH_SIZE)
+    rays = Rays.of(lens, DEPTH_POSE)
+    sweep = SurfaceSweep(rays)
+    for level_m in (0.0, 0.1, 0.25):
+        heights = np.full((340, 240), level_m, np.float32)
+        ranges = sweep.ranges_m(heights, -2.3, -1.2, 0.01)
+        exact = (DEPTH_POSE.position_m[2] - level_m) / -rays.slope
+        x = DEPTH_POSE.position_m[0] - ranges * np.cos(rays.azimuth_rad)
+        y = DEPTH_POSE.position_m[1] + ranges * np.sin(rays.azimuth_rad)
+        inside = (x > -1.4) & (x < 0.9) & (np.abs(y) < 1.1)
+        assert inside.mean() > 0.5
+        assert np.abs(ranges - exact)[inside].max() < 4e-4
+
+
+def test_rig_ranges_of_an_inclined_plane_are_right_within_a_millimetre() -> None:
+    lens = DEPTH_INTRINSICS.scaled(*DEPTH_SIZE)
+    rays = Rays.of(lens, DEPTH_POSE)
+    x = (-2.3 + np.arange(340) * 0.01)[:, None]
+    y = (-1.2 + np.arange(240) * 0.01)[None, :]
+    heights = np.maximum(0.0, 0.12 - 0.3 * x + 0.1 * y).astype(np.float32)
+    ranges = SurfaceSweep(rays).ranges_m(heights, -2.3, -1.2, 0.01)
+    hit_x = DEPTH_POSE.position_m[0] - ranges * np.cos(rays.azimuth_rad)
+    hit_y = DEPTH_POSE.position_m[1] + ranges * np.sin(rays.azimuth_rad)
+    hit_z = DEPTH_POSE.position_m[2] + ranges * rays.slope
+    wanted = 0.12 - 0.3 * hit_x + 0.1 * hit_y
+    inside = (hit_x > -0.4) & (hit_x < 0.25) & (np.abs(hit_y) < 0.6) & (wanted > 0.02)
+    assert inside.mean() > 0.2
+    assert np.abs(hit_z - wanted)[inside].max() < 1e-3
+
+
+def test_rig_depth_of_bare_floor_and_blade(materials: Materials) -> None:
+    """Every point seen lies on the floor, on the bed's sides, or on the hollow face of the blade."""
+    renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, materials=materials)
+    angle_deg = 20.0
+    lens = renderer.depth_intrinsics
+    assert lens is not None
+    points = points_m(
+        renderer.render_depth_m(state_of(SoilField(), 3.0, BladePose(angle_deg)), Look()), lens, DEPTH_POSE
+    )
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    angle = math.radians(angle_deg)
+    s, d = -x * math.sin(angle) + y * math.cos(angle), x * math.cos(angle) + y * math.sin(angle)
+    floor = (np.abs(z) < 0.001) & (np.abs(y) < 1.0)
+    hollow = 0.2165 - np.sqrt(np.maximum(0.0625 - (z - 0.127) ** 2, 0.0))
+    blade = (np.abs(d - hollow) < 0.001) & (np.abs(s) < 0.502) & (z > 0.0) & (z < 0.254)
+    lower = np.zeros(x.shape, bool)
+    lower[110:] = True  # machine parts stand above that row
+    assert (floor | blade | (np.abs(np.abs(y) - 1.0) < 0.001))[lower].mean() > 0.99
+    assert blade.mean() > 0.1
+    assert floor.mean() > 0.3
+    # both ends of the blade are in the picture
+    assert s[blade].min() < -0.49
+    assert s[blade].max() > 0.49
+
+
+@pytest.mark.parametrize(("zone", "side"), [(SceneZone.LEFT, 1), (SceneZone.RIGHT, -1)])
+def test_rig_the_operators_left_is_on_image_right(materials: Materials, zone: SceneZone, side: int) -> None:
+    field = SoilField()
+    lay_scene(field, zone, 3.0, BladePose())
+    bare, heaped = SoilField(), field
+    renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, materials=materials)
+    depth = {name: renderer.render_depth_m(state_of(f), Look()) for name, f in (("bare", bare), ("heap", heaped))}
+    nearer = (depth["bare"] - depth["heap"]) > 0.02
+    columns = np.nonzero(nearer)[1] - DEPTH_SIZE[0] / 2
+    assert nearer.mean() > 0.03
+    assert columns.mean() * side > 60
+    color, _ = Renderer(COLOR_SIZE, None, materials=materials).render(state_of(heaped), Look(color_noise=0.0))
+    empty, _ = Renderer(COLOR_SIZE, None, materials=materials).render(state_of(bare), Look(color_noise=0.0))
+    changed = np.abs(color.astype(int) - empty).max(axis=2) > 40
+    assert (np.nonzero(changed)[1].mean() - COLOR_SIZE[0] / 2) * side > 40
+
+
+def test_rig_counter_clockwise_takes_the_left_end_back(materials: Materials) -> None:
+    renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, materials=materials)
+    lens = renderer.depth_intrinsics
+    assert lens is not None
+    points = points_m(renderer.render_depth_m(state_of(SoilField(), 3.0, BladePose(30.0)), Look()), lens, DEPTH_POSE)
+    on_blade = (points[..., 2] > 0.05) & (points[..., 2] < 0.2) & (np.abs(points[..., 1]) < 0.5)
+    left = on_blade & (points[..., 1] > 0.3) & (points[..., 0] > -0.6)
+    right = on_blade & (points[..., 1] < -0.3)
+    assert points[left][:, 0].mean() < -0.1
+    assert points[right][:, 0].mean() > 0.1
+
+
+def test_rig_measured_depth_has_the_noise_holes_and_limits_of_the_camera(materials: Materials) -> None:
+    renderer = Renderer(COLOR_SIZE, (848, 480), materials=materials)
+    field = SoilField()
+    lay_scene(field, SceneZone.CENTER, 3.0, BladePose())
+    Plough(field).settle(3.0, BladePose())
+    state = state_of(field)
+    true_mm = renderer.render_depth_m(state, Look()) * 1000.0
+    frames = [renderer.render(state, Look())[1] for _ in range(6)]
+    stack = np.stack([frame for frame in frames if frame is not None]).astype(np.float64)
+    assert frames[0] is not None
+    assert frames[0].dtype == np.uint16
+    band = (true_mm > 900) & (true_mm < 1100)
+    errors = (stack - true_mm)[:, band][stack[:, band] > 0]
+    # 0.08 px of disparity: z^2 * 0.08 / (f * baseline) = 2.0 mm at 1 m
+    assert 1.5 < errors.std() < 2.6
+    assert abs(errors.mean()) < 0.3
+    reachable = (true_mm > 380) & (true_mm < 1650)
+    holes = (stack[:, reachable] == 0).mean()
+    assert 0.03 < holes < 0.10
+    assert (stack[:, true_mm < (MIN_DEPTH_M - 0.01) * 1000] == 0).all()
+    assert (stack[:, true_mm > (MAX_DEPTH_M + 0.05) * 1000] == 0).all()
+    assert (stack[0] != stack[1]).mean() > 0.3
+
+
+def test_rig_depth_is_lost_at_edges(materials: Materials) -> None:
+    renderer = Renderer(COLOR_SIZE, (848, 480), materials=materials)
+    wall = Solid("box", (0.30, 0.0, 0.15), (0.01, 0.05, 0.15), (80, 80, 80))
+    state = state_of(SoilField(), 3.0, BladePose(), wall)
+    true_m = renderer.render_depth_m(state, Look())
+    _, depth = renderer.render(state, Look(hole_share=0.0))
+    assert depth is not None
+    jump = np.abs(np.diff(true_m, axis=1)) > 0.15
+    jump &= (true_m[:, 1:] < MAX_DEPTH_M) & (true_m[:, :-1] < MAX_DEPTH_M)
+    assert jump.sum() > 50
+    assert (depth[:, 1:][jump] == 0).mean() > 0.9
+
+
+def test_rig_pictures_repeat_by_seed(materials: Materials) -> None:
+    field = SoilField()
+    lay_scene(field, SceneZone.LEFT, 3.0, BladePose(), seed=4)
+
+    def film(seed: int) -> list[npt.NDArray[np.uint8]]:
+        renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, seed=seed)
+        pictures: list[npt.NDArray[np.uint8]] = []
+        for _ in range(2):
+            color, depth = renderer.render(state_of(field), Look())
+            assert depth is not None
+            pictures += [color, depth.view(np.uint8)]
+        return pictures
+
+    first, again, other = film(5), film(5), film(6)
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not np.array_equal(first[0], other[0])
+
+
+def test_rig_color_is_a_whole_picture_under_any_look(materials: Materials) -> None:
+    field = SoilField()
+    lay_scene(field, SceneZone.EVEN, 3.0, BladePose())
+    renderer = Renderer(COLOR_SIZE, None, materials=materials)
+    plain, depth = renderer.render(state_of(field), Look())
+    assert depth is None
+    assert plain.shape == (200, 320, 3)
+    assert plain.dtype == np.uint8
+    looks = {
+        "dark": Look(exposure=0.3),
+        "red": Look(red_cast=0.3),
+        "wet": Look(wetness=1.0),
+        "sand": Look(soil="sand"),
+        "rusty": Look(blade="rusty"),
+        "painted": Look(blade="painted"),
+        "concrete": Look(ground="concrete"),
+        "low sun": Look(sun_azimuth_deg=-90.0, sun_elevation_deg=10.0),
+        "shadow": Look(machine_shadow=0.7),
+        "night": Look(sun_strength=0.0, ambient=0.1),
+    }
+    pictures = {name: renderer.render(state_of(field), look)[0] for name, look in looks.items()}
+    for name, picture in pictures.items():
+        assert np.abs(picture.astype(int) - plain).mean() > 1.0, name
+    assert pictures["dark"].mean() < 0.5 * plain.mean()
+    assert pictures["wet"].mean() < plain.mean()
+    blue, _, red = (pictures["red"][..., channel].mean() / plain[..., channel].mean() for channel in range(3))
+    assert red > 1.1 * blue
+    left_half, right_half = pictures["shadow"][:, 160:].mean(), pictures["shadow"][:, :160].mean()
+    assert left_half < right_half  # the machine's shadow falls from its left, which is image right
+
+
+def test_rig_soil_texture_stays_on_the_ground(materials: Materials) -> None:
+    """Driving moves the picture of the ground, not the pattern on it."""
+    field = SoilField()
+    field.heights_m += 0.05
+    renderer = Renderer((640, 400), None, materials=materials)
+    still = Look(color_noise=0.0, shadows=False, ambient=0.8, sun_strength=0.4)
+    near, far = (renderer.render(state_of(field, x_m), still)[0].astype(np.float32).mean(axis=2) for x_m in (3.0, 3.1))
+    rays = Rays.of(COLOR_INTRINSICS.scaled(640, 400), COLOR_POSE)
+    depth = (COLOR_POSE.position_m[2] - 0.05) / -rays.dz
+    seen, moved = [], []
+    for row, column in [(r, c) for r in range(250, 380, 13) for c in range(120, 520, 17)]:
+        x = COLOR_POSE.position_m[0] + depth[row, column] * rays.dx[row, column] - 0.1
+        y = COLOR_POSE.position_m[1] + depth[row, column] * rays.dy[row, column]
+        local = np.array(COLOR_POSE.rotation).T @ (np.array([x, y, 0.05]) - np.array(COLOR_POSE.position_m))
+        lens = COLOR_INTRINSICS.scaled(640, 400)
+        u, v = lens.fx * local[0] / local[2] + lens.cx, lens.fy * local[1] / local[2] + lens.cy
+        if 2 <= u < 637 and 2 <= v < 397:
+            seen.append(near[row, column])
+            moved.append(far[round(v), round(u)])
+    assert len(seen) > 50
+    assert np.corrcoef(seen, moved)[0, 1] > 0.6
+
+
+def test_rig_a_knock_moves_the_picture(materials: Materials) -> None:
+    color_pose, depth_pose = knocked((0.02, 0.03, 0.0), (4.0, -3.0, 2.0))
+    straight = Renderer(COLOR_SIZE, DEPTH_SIZE, materials=materials)
+    bent = Renderer(COLOR_SIZE, DEPTH_SIZE, color_pose=color_pose, depth_pose=depth_pose, materials=materials)
+    state = state_of(SoilField())
+    assert np.abs(straight.render_depth_m(state, Look()) - bent.render_depth_m(state, Look())).mean() > 0.02
+    rotation = np.array(color_pose.rotation)
+    assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    offset = np.array(depth_pose.position_m) - np.array(color_pose.position_m)
+    assert np.linalg.norm(offset) == pytest.approx(0.059, abs=1e-9)  # one housing
+    unmoved_color, unmoved_depth = knocked((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert np.allclose(unmoved_color.position_m, COLOR_POSE.position_m)
+    assert np.allclose(unmoved_depth.position_m, DEPTH_POSE.position_m)
+
+
+def test_rig_camera_data_are_those_of_a_d455() -> None:
+    data = camera_json(COLOR_INTRINSICS, DEPTH_INTRINSICS)
+    color, depth = data["color"], data["depth"]
+    horizontal = 2 * math.degrees(math.atan(color["width"] / 2 / color["fx"]))
+    vertical = 2 * math.degrees(math.atan(color["height"] / 2 / color["fy"]))
+    assert horizontal == pytest.approx(90.0, abs=1.5)
+    assert vertical == pytest.approx(65.0, abs=1.0)
+    assert 2 * math.degrees(math.atan(depth["width"] / 2 / depth["fx"])) == pytest.approx(89.5, abs=2.5)
+    assert data["depth_to_color"]["translation_m"] == pytest.approx([-0.059, 0.0, 0.0])
+    rotation = np.array(color["rotation_vehicle_from_optical"])
+    assert rotation[1, 0] == 1.0  # image right is vehicle +y
+    assert math.degrees(math.asin(-rotation[2, 2])) == pytest.approx(35.0)
