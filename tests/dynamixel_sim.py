@@ -73,7 +73,8 @@ async def bench(
     """A virtual servo at ``folder/servo`` and a rotator on it, opened unless told otherwise; all closed at the end."""
     servo = servo or VirtualServo()
     bus = VirtualServoBus([servo], folder / "servo", **(wire or {}))
-    settings = RotatorSettings(**{"port": str(folder / "servo"), **changes})
+    brisk = {"velocity_deg_per_s": 60.0, "acceleration_deg_per_s2": 240.0}  # so that tests need not wait for the blade
+    settings = RotatorSettings(**{"port": str(folder / "servo"), **brisk, **changes})
     rotator = Ph54Rotator(settings)
     await bus.start()
     try:

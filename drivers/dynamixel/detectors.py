@@ -90,13 +90,21 @@ class MotionDetectors:
         self._goal_deg = s.goal_deg
         self._goal_since_s = s.time_s
         if s.goal_deg is not None:
-            way_deg = abs(s.goal_deg - s.angle_deg)
-            st = self._settings
-            self._move_s = way_deg / st.velocity_deg_per_s + 2 * st.velocity_deg_per_s / st.acceleration_deg_per_s2
+            self._move_s = self._duration_s(abs(s.goal_deg - s.angle_deg), abs(s.velocity_deg_per_s))
         if moved:
             self._rest_deg = None
         if started:
             self._progress_deg, self._progress_s = s.angle_deg, s.time_s
+
+    def _duration_s(self, way_deg: float, speed_deg_per_s: float) -> float:
+        """How long the profile takes for a way, braking from a speed in the wrong direction first."""
+        top, acceleration = self._settings.velocity_deg_per_s, self._settings.acceleration_deg_per_s2
+        way_deg += speed_deg_per_s**2 / acceleration
+        if way_deg < top**2 / acceleration:
+            move_s = 2 * math.sqrt(way_deg / acceleration)
+        else:
+            move_s = way_deg / top + top / acceleration
+        return move_s + speed_deg_per_s / acceleration
 
     def _watch_stuck(self, s: Sample, goal_deg: float) -> None:
         arrived = abs(goal_deg - s.angle_deg) <= self._settings.in_position_deg

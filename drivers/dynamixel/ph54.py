@@ -52,6 +52,8 @@ _RECONNECT_MOST_S = 1.0
 _REBOOT_S = 5.0
 _STOP_S = 0.5
 """A disarm gives the blade so long to come to rest before torque goes off."""
+_STILL_READS_N = 5
+"""So many reads in a row without movement are rest; one alone may be a turning point."""
 _CLOSE_S = 1.5
 _CORRUPT_N, _CORRUPT_WINDOW_S = 3, 1.0
 _LINK_FAULTS = ("no_reply", "corrupt_replies", "unplugged", "wrong_device")
@@ -105,6 +107,7 @@ class Ph54Rotator:
         self._hold_profile = False
         self._torque_on = False
         self._torque_is_ours = False
+        self._tripped = False
         self._raw_counts: int | None = None
         self._turns_unknown = False
         self._health_s = self._goals_s = -math.inf
@@ -179,6 +182,7 @@ class Ph54Rotator:
             self._note_sent(counts)
             self._detectors.restart()
             self._raw_counts = None
+            self._tripped = False
             self._set_torque(True)
             self._lifecycle = Lifecycle.ACTIVE
 
@@ -330,8 +334,9 @@ class Ph54Rotator:
         await self._read_health(device, attempts_n=PATIENT_N)
         await self._read_telemetry(device, attempts_n=PATIENT_N)
         now_s = self._clock.now_s()
+        self._tripped = False
         if goals["bus_watchdog"] == WATCHDOG_TRIPPED:
-            self._faults.event("watchdog_tripped", "the servo's bus watchdog had stopped it", now_s)
+            self._note_trip(now_s)
         elif self._torque_is_ours and not self._torque_on and goals["bus_watchdog"] == 0:
             self._faults.event("ram_reset", "power was cut: the servo is back with its RAM registers reset", now_s)
         elif self._torque_is_ours and not self._torque_on:
@@ -345,6 +350,9 @@ class Ph54Rotator:
             await device.torque(False)
             self._set_torque(False)
         self._torque_is_ours = self._torque_is_ours and self._torque_on
+        if self._tripped and not self._torque_on:  # unpowered, no stale goal can come alive
+            await device.write("bus_watchdog", 0)
+            self._tripped = False
 
     def _start(self) -> None:
         self._task = asyncio.get_running_loop().create_task(self._run(), name="rotation-servo")
@@ -533,14 +541,20 @@ class Ph54Rotator:
         self._goals_s = now_s = self._clock.now_s()
         goals, _ = await device.read_block(device.goal_block, attempts_n=1)
         if goals["bus_watchdog"] == WATCHDOG_TRIPPED:
-            self._faults.event("watchdog_tripped", "the servo's bus watchdog has stopped it; arm again", now_s)
+            self._note_trip(now_s)
             if self._lifecycle is Lifecycle.ACTIVE:
                 self._lifecycle = Lifecycle.STANDBY
-                await self._make_safe(device)
+            await self._make_safe(device)
         elif self._lifecycle is Lifecycle.ACTIVE and goals["bus_watchdog"] != arming.watchdog_counts(self.settings):
             self._faults.event("ram_reset", f"the bus watchdog reads {goals['bus_watchdog']}, not as written", now_s)
             self._lifecycle = Lifecycle.STANDBY
             await self._make_safe(device)
+
+    def _note_trip(self, now_s: float) -> None:
+        """Tell of a trip once; the servo's register may stay tripped for long (torque kept on) and no harm in that."""
+        if not self._tripped:
+            self._faults.event("watchdog_tripped", "the servo's bus watchdog has stopped it; arm again", now_s)
+        self._tripped = True
 
     def _set_torque(self, on: bool) -> None:
         self._torque_on = on
@@ -587,7 +601,7 @@ class Ph54Rotator:
         low, high = self.calibration.servo_limits()
         counts = max(low, min(high, self.calibration.counts(angle.value)))  # beyond them the servo would refuse
         profile = arming.profile_counts(self.settings, self.calibration, arming.HOLD_ACCELERATION_FACTOR)
-        await device.write_block(device.profile_block, {**profile, "goal_position": counts}, attempts_n=2, urgent=True)
+        await device.write_block(device.profile_block, {**profile, "goal_position": counts}, attempts_n=1, urgent=True)
         self._hold_profile = True
         self._hold_wanted = False
         self._note_sent(counts)
@@ -595,10 +609,10 @@ class Ph54Rotator:
     async def _send_goal(self, device: Ph54Device, counts: int) -> None:
         if self._hold_profile:
             profile = arming.profile_counts(self.settings, self.calibration)
-            await device.write_block(device.profile_block, {**profile, "goal_position": counts}, attempts_n=2)
+            await device.write_block(device.profile_block, {**profile, "goal_position": counts}, attempts_n=1)
             self._hold_profile = False
         elif counts != self._sent_counts:
-            await device.write("goal_position", counts, attempts_n=2)
+            await device.write("goal_position", counts, attempts_n=1)
         else:
             return
         self._note_sent(counts)
@@ -626,14 +640,13 @@ class Ph54Rotator:
         async with self._turn:
             device = self._connected()
             self._goal_deg, self._hold_wanted = None, True
-            await self._send_command()
+            await self._tolerant(self._send_command())
             loop = asyncio.get_running_loop()
-            until_s = loop.time() + _STOP_S
-            while loop.time() < until_s:
+            until_s, still_n = loop.time() + _STOP_S, 0
+            while loop.time() < until_s and still_n < _STILL_READS_N:
                 await self._tolerant(self._read_telemetry(device))
                 speed = self._telemetry.velocity_deg_per_s
-                if speed is None or abs(speed.value) < 1.0:
-                    break
+                still_n = still_n + 1 if speed is not None and abs(speed.value) < 1.0 else 0
             if off:
                 await device.torque(False)
                 self._set_torque(False)

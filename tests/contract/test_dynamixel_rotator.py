@@ -65,7 +65,9 @@ class RotatorConformance:
         held_deg = bench.servo.shaft_deg
         await bench.until(lambda: abs(bench.servo.shaft_velocity_deg_per_s) < 0.5)
         await asyncio.sleep(0.5)
-        assert bench.servo.shaft_deg == pytest.approx(held_deg, abs=4.0)
+        assert bench.servo.shaft_deg == pytest.approx(
+            held_deg, abs=6.0
+        )  # what it turns within the 30 ms delay, and the braking
         assert bench.rotator.lifecycle is Lifecycle.ACTIVE
 
     async def test_a_goal_not_renewed_becomes_a_hold(self, bench: Bench) -> None:
@@ -75,11 +77,11 @@ class RotatorConformance:
         await bench.until(lambda: abs(bench.servo.shaft_velocity_deg_per_s) < 0.5)
         assert bench.servo.shaft_deg < 45.0
 
-    @pytest.mark.parametrize("goal_deg", [math.nan, math.inf, -math.inf, 60.01, -60.01, 1e9])
-    async def test_illegal_goals_are_refused_and_change_nothing(self, bench: Bench, goal_deg: float) -> None:
+    async def test_illegal_goals_are_refused_and_change_nothing(self, bench: Bench) -> None:
         await bench.rotator.arm()
-        with pytest.raises(CommandRangeError):
-            bench.rotator.set_goal_deg(goal_deg)
+        for goal_deg in (math.nan, math.inf, -math.inf, 60.01, -60.01, 1e9):
+            with pytest.raises(CommandRangeError):
+                bench.rotator.set_goal_deg(goal_deg)
         await asyncio.sleep(0.1)
         assert bench.servo.shaft_deg == pytest.approx(7.0, abs=0.1)
 

@@ -263,14 +263,14 @@ class VirtualServoBus:
         self._last_byte_s = now_s
         errors_n = self._decoder.crc_errors_n
         packets = self._decoder.feed(data)
+        packets = [p for p in packets if not self._strikes("drop_requests")]
         if packets:
             for servo in self.servos:
-                servo.note_traffic(heard_s)
+                if servo.listens(heard_s):
+                    servo.note_traffic(heard_s)
         self._advance()
         for packet in packets:
             self.requests_n += 1
-            if self._strikes("drop_requests"):
-                continue
             baud_n = self.baud_n
             ready_s = now_s + wire_s(len(packet.raw), baud_n)
             for servo, reply in answers(self.servos, packet, now_s):

@@ -84,6 +84,7 @@ class PlantSettings:
     backlash_deg: float = 0.1
     torque_nm_per_a: float = 4.806
     no_load_current_a: float = 1.65
+    no_load_deg_per_s: float = 198.6
     ambient_c: float = 25.0
     heat_c_per_a2: float = 0.35
     heat_time_s: float = 300.0
@@ -138,6 +139,10 @@ class Plant:
         if self.reversed_loop:
             error_deg, slip, feed_nm = -error_deg, -self.velocity_deg_per_s, 0.0
         asked = per_deg * stiffness * (omega * omega * error_deg + 2 * omega * slip) + feed_nm + self._integral_nm
+        driving = asked * self.velocity_deg_per_s > 0
+        limit_nm *= (
+            max(0.0, min(1.0, 5.0 * (1.02 - abs(self.velocity_deg_per_s) / s.no_load_deg_per_s))) if driving else 1.0
+        )
         self.torque_nm = max(-limit_nm, min(limit_nm, asked))
         if self.torque_nm == asked:
             self.saturated_s = 0.0
