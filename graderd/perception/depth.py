@@ -9,7 +9,7 @@ the noise add up to litres.
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from graderd.core.blade import BladeGeometry
 from graderd.hal.camera import DepthImage
 from graderd.perception.decide import Verdict, decide
 from graderd.perception.geometry import F32, F64, U8, View, third_outlines_px
-from graderd.perception.registration import BladeFinder, BladeFix, Ground, GroundFit
+from graderd.perception.registration import SUNK_M, BladeFinder, BladeFix, Ground, GroundFit
 from graderd.perception.settings import DecisionSettings, DepthSettings
 
 I64 = npt.NDArray[np.intp]
@@ -86,6 +86,11 @@ class DepthJudge:
         x, y, z, d = x[near], y[near], z[near], d[near]
         s = y * cos - x * sin
         setback = self._finder.setback(z)
+        sunk = self._finder.sunk_m(s, d, z, setback)
+        if sunk > SUNK_M:
+            ground = replace(ground, offset_m=ground.offset_m - sunk)
+            z = np.asarray(z + np.float32(sunk), dtype=np.float32)
+            setback = self._finder.setback(z)
         fix = self._finder.find(s, d, z, setback)
         # Small rotation and shift of the blade against its calibrated place.
         turn = np.float32(np.radians(fix.turn_deg))

@@ -24,6 +24,9 @@ CELL_FLAT_M = 0.010
 """Heights within a cell of ground spread less than this; the side of a pile spreads more."""
 INLIER_M = 0.010
 HYPOTHESES_N = 96
+TOP_BIN_M = 0.005
+SUNK_M = 0.022
+"""The blade lower in the ground than this: what was taken for the ground is a layer of soil."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +149,7 @@ class BladeFinder:
 
     SEARCH_M = 0.09
     COLUMNS_N = 12
+    TOP_BANDS_N = 16
 
     def __init__(self, blade: BladeGeometry) -> None:
         self._blade = blade
@@ -156,6 +160,26 @@ class BladeFinder:
         """Set-back of the hollow face at heights ``z`` (table look-up, 1 mm)."""
         index = np.clip((z + np.float32(0.2)) * np.float32(1000.0), 0, 1000).astype(np.int32)
         return np.asarray(self._setback[index], dtype=np.float32)
+
+    def sunk_m(self, s: F32, d: F32, z: F32, setback: F32) -> float:
+        """How far the blade's upper edge lies lower than it would above this ground; 0 where it cannot be told.
+
+        A level layer of soil all round looks like ground. But a blade does not stand deep in the ground: where it
+        seems to, the level was the layer's.
+        """
+        blade = self._blade
+        half = blade.length_m / 2 - 0.03
+        take = np.flatnonzero((np.abs(d + setback) < self.SEARCH_M) & (np.abs(s) < half) & (z > 0.03))
+        band = ((s[take] + np.float32(half)) * np.float32(self.TOP_BANDS_N / (2 * half))).astype(np.int32)
+        bins = round(2 * blade.height_m / TOP_BIN_M)
+        level = np.minimum(z[take] * np.float32(1 / TOP_BIN_M), bins - 1).astype(np.int32)
+        counts = np.bincount(band * bins + level, minlength=(self.TOP_BANDS_N + 1) * bins)
+        filled = counts.reshape(-1, bins)[: self.TOP_BANDS_N] >= 2
+        known = filled.any(axis=1)
+        if known.sum() < self.TOP_BANDS_N // 2:
+            return 0.0
+        tops = (bins - np.argmax(filled[known, ::-1], axis=1)) * TOP_BIN_M
+        return blade.bottom_z_m + blade.height_m - float(np.median(tops))
 
     def find(self, s: F32, d: F32, z: F32, setback: F32) -> BladeFix:
         """``s, d, z``: points in blade coordinates, level ground at z = 0; ``setback`` that of their heights."""
