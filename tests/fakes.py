@@ -1,0 +1,148 @@
+"""Devices and eyes for tests of the runtime: they obey the contracts and do at once what they are told."""
+
+from __future__ import annotations
+
+from graderd.core.zones import SoilObservation
+from graderd.hal.clock import ManualClock
+from graderd.hal.errors import CommandRangeError, DeviceError, LifecycleError
+from graderd.hal.fault import DeviceFault
+from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.linear_actuator import ActuatorTelemetry
+from graderd.hal.reading import Reading
+from graderd.hal.rotator import RotatorTelemetry
+from graderd.runtime.devices import Devices
+
+
+class FakeAxis:
+    """What rotator and actuator have in common. ``log`` is shared, so that the order across devices shows."""
+
+    def __init__(self, name: str, clock: ManualClock, position: float, log: list[str]) -> None:
+        self.name = name
+        self.clock = clock
+        self.position = position
+        self.log = log
+        self.lifecycle = Lifecycle.STANDBY
+        self.present: list[DeviceFault] = []
+        self.refuse_arm: DeviceError | None = None
+        self.refuse_goal: DeviceError | None = None
+        self.stuck = False
+        self.silent_since_s: float | None = None
+        self.hold_raises = False
+        self.held_n = 0
+
+    def reading(self) -> Reading[float]:
+        time_s = self.clock.now_s() if self.silent_since_s is None else self.silent_since_s
+        return Reading(self.position, time_s)
+
+    def faults(self) -> tuple[DeviceFault, ...]:
+        return tuple(self.present)
+
+    def go(self, goal: float) -> None:
+        if self.refuse_goal is not None:
+            raise self.refuse_goal
+        if self.lifecycle is not Lifecycle.ACTIVE:
+            raise LifecycleError(self.name, "not active")
+        if not -400 < goal < 400:
+            raise CommandRangeError(self.name, "beyond")
+        self.log.append(f"{self.name} goal {goal:.3f}")
+        if not self.stuck:
+            self.position = goal
+
+    def hold(self) -> None:
+        self.log.append(f"{self.name} hold")
+        self.held_n += 1
+        if self.hold_raises:
+            raise RuntimeError("driver bug")
+
+    async def open(self) -> None:
+        self.lifecycle = Lifecycle.STANDBY
+        self.log.append(f"{self.name} open")
+
+    async def arm(self) -> None:
+        if self.refuse_arm is not None:
+            raise self.refuse_arm
+        self.lifecycle = Lifecycle.ACTIVE
+        self.log.append(f"{self.name} arm")
+
+    async def disarm(self) -> None:
+        self.lifecycle = Lifecycle.STANDBY
+        self.log.append(f"{self.name} disarm")
+
+    async def close(self) -> None:
+        self.lifecycle = Lifecycle.CLOSED
+        self.log.append(f"{self.name} close")
+
+
+class FakeRotator(FakeAxis):
+    """A rotator that is where it was told to be."""
+
+    def telemetry(self) -> RotatorTelemetry:
+        return RotatorTelemetry(angle_deg=self.reading())
+
+    def set_goal_deg(self, goal_deg: float) -> None:
+        self.go(goal_deg)
+
+
+class FakeActuator(FakeAxis):
+    """An actuator that is where it was told to be."""
+
+    def telemetry(self) -> ActuatorTelemetry:
+        return ActuatorTelemetry(position_mm=self.reading())
+
+    def set_target_mm(self, target_mm: float, speed_share: float = 1.0) -> None:
+        assert 0.0 < speed_share <= 1.0
+        self.go(target_mm)
+
+
+class FakeLink:
+    """A bus that is always there."""
+
+    def __init__(self) -> None:
+        self.present: list[DeviceFault] = []
+
+    async def open(self) -> None:
+        return None
+
+    def faults(self) -> tuple[DeviceFault, ...]:
+        return tuple(self.present)
+
+    async def close(self) -> None:
+        return None
+
+
+class FakeEyes:
+    """Perception whose next observation the test sets."""
+
+    def __init__(self) -> None:
+        self.next: SoilObservation | None = None
+        self.present: list[DeviceFault] = []
+        self.angles: list[tuple[float, float]] = []
+
+    def take_observation(self) -> SoilObservation | None:
+        taken, self.next = self.next, None
+        return taken
+
+    def faults(self) -> tuple[DeviceFault, ...]:
+        return tuple(self.present)
+
+    def send_angle(self, angle_deg: float, time_s: float) -> None:
+        self.angles.append((angle_deg, time_s))
+
+
+class FakeMachine:
+    """All four axes at their resting place, eyes, bus and a clock that moves when told."""
+
+    def __init__(self) -> None:
+        self.clock = ManualClock(1000.0)
+        self.log: list[str] = []
+        self.rotation = FakeRotator("rotation", self.clock, 0.0, self.log)
+        self.lift_left = FakeActuator("lift_left", self.clock, 100.0, self.log)
+        self.lift_right = FakeActuator("lift_right", self.clock, 100.0, self.log)
+        self.tilt = FakeActuator("tilt", self.clock, 50.0, self.log)
+        self.link = FakeLink()
+        self.eyes = FakeEyes()
+        self.devices = Devices(
+            rotation=self.rotation,
+            link=self.link,
+            actuators={"lift_left": self.lift_left, "lift_right": self.lift_right, "tilt": self.tilt},
+        )

@@ -1,0 +1,244 @@
+"""The control loop over fake devices, tick by tick on a manual clock."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from graderd.config import Config
+from graderd.core import commands as cmd
+from graderd.core.machine import Mode
+from graderd.core.zones import SoilObservation, Zone
+from graderd.hal.errors import DeviceRefusedError
+from graderd.hal.fault import DeviceFault
+from graderd.hal.lifecycle import Lifecycle
+from graderd.runtime.control import ControlLoop
+from graderd.runtime.state_file import StateFile
+from tests.fakes import FakeMachine
+
+TICK_S = 0.02
+
+
+class Bench:
+    """A control loop on a fake machine, ticked by hand."""
+
+    def __init__(self, directory: Path) -> None:
+        self.machine = FakeMachine()
+        self.loop = ControlLoop(
+            Config(), self.machine.devices, self.machine.eyes, self.machine.clock, StateFile(str(directory))
+        )
+
+    async def ticks(self, count_n: int = 1, zone: Zone | None = None, **shares: float) -> None:
+        """Tick ``count_n`` times; with ``zone``, a new observation of it every third tick."""
+        for index in range(count_n):
+            self.machine.clock.advance(TICK_S)
+            if zone is not None and index % 3 == 0:
+                now_s = self.machine.clock.now_s()
+                self.machine.eyes.next = SoilObservation(now_s, zone, 0.9, "", **shares)
+            self.loop.tick()
+            for _ in range(4):
+                await asyncio.sleep(0)  # the power keeper's task takes its turns
+
+    async def do(self, command: cmd.Command) -> cmd.Reply:
+        """Send a command and tick until it is answered."""
+        task = asyncio.create_task(self.loop.command(command))
+        for _ in range(5):
+            await asyncio.sleep(0)
+            if task.done():
+                break
+            await self.ticks()
+        return await task
+
+    async def arm(self) -> None:
+        assert (await self.do(cmd.Arm(client="t"))).accepted
+        await self.ticks(4)
+        assert self.loop.state.mode is Mode.MANUAL
+
+
+@pytest.fixture
+async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
+    made = Bench(tmp_path)
+    yield made
+    await made.loop._power.close()
+
+
+async def test_nothing_is_commanded_before_arming(bench: Bench) -> None:
+    await bench.ticks(50, Zone.LEFT, share_left=1.0)
+    assert bench.machine.log == []
+
+
+async def test_arming_powers_everything_and_moves_nothing(bench: Bench) -> None:
+    await bench.arm()
+    assert sorted(bench.machine.log) == ["lift_left arm", "lift_right arm", "rotation arm", "tilt arm"]
+    await bench.ticks(50)
+    assert not any("goal" in line for line in bench.machine.log)
+
+
+async def test_auto_turns_to_the_rules_angle_within_the_gates_speed(bench: Bench) -> None:
+    await bench.arm()
+    assert (await bench.do(cmd.Auto(client="t"))).accepted
+    await bench.ticks(200, Zone.LEFT, share_left=0.9, share_center=0.1)
+    assert bench.machine.rotation.position == pytest.approx(30.0)
+    goals = [float(line.split()[-1]) for line in bench.machine.log if line.startswith("rotation goal")]
+    steps = [b - a for a, b in zip([0.0, *goals], goals, strict=False)]
+    assert max(steps) <= 25.0 * TICK_S + 1e-6
+    assert not any("lift" in line and "goal" in line for line in bench.machine.log)
+
+
+async def test_unknown_holds(bench: Bench) -> None:
+    await bench.arm()
+    await bench.do(cmd.Auto(client="t"))
+    await bench.ticks(100, Zone.UNKNOWN)
+    assert not any("goal" in line for line in bench.machine.log)
+
+
+async def test_stop_holds_every_axis_before_it_returns_and_latches(bench: Bench, tmp_path: Path) -> None:
+    await bench.arm()
+    await bench.do(cmd.Jog(axis="rotate", value=20.0, client="t"))
+    await bench.ticks(5)
+    bench.machine.log.clear()
+    reply = bench.loop.stop_now(cmd.Stop(reason="test", client="t"))
+    assert reply.accepted
+    assert {line for line in bench.machine.log if "hold" in line} == {
+        "rotation hold", "lift_left hold", "lift_right hold", "tilt hold"
+    }  # fmt: skip
+    assert bench.loop.state.mode is Mode.STOPPED
+    bench.machine.log.clear()
+    await bench.ticks(20)
+    assert not any("goal" in line for line in bench.machine.log)
+    assert all(d.lifecycle is Lifecycle.STANDBY for d in bench.machine.devices.all().values())
+    refused = await bench.do(cmd.Arm(client="t"))
+    assert not refused.accepted
+    last = StateFile(str(tmp_path)).load()
+    assert last is not None
+    assert last.reason == "test (by t)"
+
+
+async def test_one_driver_that_fails_to_hold_does_not_keep_the_others_from_it(bench: Bench) -> None:
+    await bench.arm()
+    bench.machine.rotation.hold_raises = True
+    bench.loop.stop_now(cmd.Stop())
+    assert bench.machine.tilt.held_n > 0
+    assert bench.machine.lift_left.held_n > 0
+
+
+async def test_a_jog_stops_when_its_lease_is_not_renewed(bench: Bench) -> None:
+    await bench.arm()
+    await bench.do(cmd.Jog(axis="rotate", value=20.0, client="t"))
+    await bench.ticks(30)
+    assert 0.0 < bench.machine.rotation.position < 20.0
+    reached = bench.machine.rotation.position
+    assert bench.machine.rotation.held_n == 1
+    await bench.ticks(30)
+    assert bench.machine.rotation.position == reached
+
+
+async def test_a_renewed_jog_arrives(bench: Bench) -> None:
+    await bench.arm()
+    await bench.do(cmd.Jog(axis="height", value=30.0, client="t"))
+    for _ in range(20):
+        await bench.do(cmd.Renew(client="t"))
+        await bench.ticks(5)
+    assert bench.machine.lift_left.position == pytest.approx(130.0)
+    assert bench.machine.lift_right.position == pytest.approx(130.0)
+
+
+async def test_a_jog_beyond_a_limit_is_refused_and_nothing_moves(bench: Bench) -> None:
+    await bench.arm()
+    reply = await bench.do(cmd.Jog(axis="rotate", value=61.0, client="t"))
+    assert not reply.accepted
+    assert "61.0 deg" in reply.message
+    assert "-60 to 60" in reply.message
+    await bench.ticks(10)
+    assert not any("goal" in line for line in bench.machine.log)
+
+
+async def test_a_stale_axis_holds_and_the_others_go_on(bench: Bench) -> None:
+    await bench.arm()
+    await bench.do(cmd.Preset(name="cast_left", client="t"))
+    bench.machine.lift_left.silent_since_s = bench.machine.clock.now_s() - 1.0
+    bench.machine.log.clear()
+    await bench.ticks(5)
+    assert any(line.startswith("rotation goal") for line in bench.machine.log)
+    assert not any(line.startswith("lift") and "goal" in line for line in bench.machine.log)
+
+
+async def test_arming_is_refused_with_the_list_of_what_is_unmet(bench: Bench) -> None:
+    bench.machine.tilt.lifecycle = Lifecycle.FAILED
+    bench.machine.rotation.position = 75.0
+    reply = await bench.do(cmd.Arm(client="t"))
+    assert not reply.accepted
+    assert "tilt: failed" in reply.message
+    assert "rotation position: 75.0 deg is outside -60 to 60 deg" in reply.message
+    assert bench.machine.log == []
+
+
+async def test_a_device_that_refuses_arming_leaves_the_machine_disarmed_with_the_reason(bench: Bench) -> None:
+    bench.machine.tilt.refuse_arm = DeviceRefusedError("tilt", "limits did not read back", "check the profile")
+    await bench.do(cmd.Arm(client="t"))
+    await bench.ticks(10)
+    assert bench.loop.state.mode is Mode.DISARMED
+    assert "limits did not read back" in bench.loop.state.reason
+    assert all(d.lifecycle is Lifecycle.STANDBY for d in bench.machine.devices.all().values())
+
+
+async def test_a_lost_device_disarms_and_needs_a_new_arm(bench: Bench) -> None:
+    await bench.arm()
+    bench.machine.rotation.lifecycle = Lifecycle.FAILED
+    await bench.ticks(3)
+    assert bench.loop.state.mode is Mode.DISARMED
+    bench.machine.rotation.lifecycle = Lifecycle.STANDBY
+    await bench.ticks(50)
+    assert bench.loop.state.mode is Mode.DISARMED
+
+
+async def test_a_driver_that_refuses_a_goal_makes_the_axis_hold_and_says_why(bench: Bench) -> None:
+    await bench.arm()
+    bench.machine.rotation.refuse_goal = DeviceRefusedError("rotation", "soft limit")
+    await bench.do(cmd.Jog(axis="rotate", value=10.0, client="t"))
+    await bench.ticks(2)
+    assert bench.loop.passed["rotation"].limited is None
+    assert "soft limit" in bench.loop.passed["rotation"].reason
+
+
+async def test_an_unknown_condition_of_a_driver_stops_the_machine(bench: Bench) -> None:
+    await bench.arm()
+    fault = DeviceFault("rotation", "something_new", "42", bench.machine.clock.now_s())
+    bench.machine.rotation.present.append(fault)
+    await bench.ticks(2)
+    assert bench.loop.state.mode is Mode.STOPPED
+    refused = await bench.do(cmd.Reset(client="t"))
+    assert not refused.accepted
+    bench.machine.rotation.present.clear()
+    await bench.ticks(1)
+    assert (await bench.do(cmd.Reset(client="t"))).accepted
+    assert bench.loop.faults.active == ()
+
+
+async def test_the_measured_angle_goes_to_perception_every_tick(bench: Bench) -> None:
+    bench.machine.rotation.position = 12.5
+    await bench.ticks(3)
+    assert [angle for angle, _ in bench.machine.eyes.angles] == [12.5] * 3
+
+
+async def test_commands_of_one_tick_get_their_own_replies_with_stop_first(bench: Bench) -> None:
+    await bench.arm()
+    jog = asyncio.create_task(bench.loop.command(cmd.Jog(axis="rotate", value=5.0, client="t")))
+    auto = asyncio.create_task(bench.loop.command(cmd.Auto(client="u")))
+    await asyncio.sleep(0)
+    await bench.ticks()
+    assert (await jog).command == "jog"
+    assert (await jog).accepted
+    assert not (await auto).accepted
+
+
+async def test_a_flood_of_commands_is_worked_off_in_portions(bench: Bench) -> None:
+    tasks = [asyncio.create_task(bench.loop.command(cmd.Renew(client=f"c{n}"))) for n in range(100)]
+    await asyncio.sleep(0)
+    await bench.ticks()
+    assert sum(task.done() for task in tasks) == 32
+    await bench.ticks(3)
+    assert all(task.done() for task in tasks)

@@ -1,0 +1,165 @@
+"""The small parts of the runtime: state file, systemd notifier, recorder, health watch, angle history."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from pathlib import Path
+
+import pytest
+
+from graderd.config import Config, parse
+from graderd.core.machine import Mode
+from graderd.core.status import Status
+from graderd.runtime.app.worker import AngleHistory, settings_not_kept
+from graderd.runtime.health import HealthWatch
+from graderd.runtime.recorder import Recorder
+from graderd.runtime.sd_notify import SystemdNotifier
+from graderd.runtime.state_file import StateFile
+
+STATUS = Status(
+    time_s=1.0, wall_time="2026-01-01T00:00:00Z", version="0", simulated=True, mode=Mode.DISARMED, reason="t"
+)
+
+
+def test_the_last_stop_survives_a_restart(tmp_path: Path) -> None:
+    StateFile(str(tmp_path / "new")).save("dog on the site")
+    found = StateFile(str(tmp_path / "new")).load()
+    assert found is not None
+    assert found.reason == "dog on the site"
+    assert "dog on the site (" in str(found)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b'{"reason": 1}', b"\xff", b'{"reason": "x", "wall_time": "y", "z": 1}']
+)
+def test_a_damaged_state_file_is_set_aside_and_told(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "last_stop.json"
+    path.write_bytes(content)
+    state = StateFile(str(tmp_path))
+    assert state.load() is None
+    assert "last_stop.json" in state.problem
+    assert (tmp_path / "last_stop.damaged").read_bytes() == content
+    assert not path.exists()
+    state.save("next")
+    assert state.problem == ""
+
+
+def test_a_state_directory_that_cannot_be_written_is_told_and_raises_nothing(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    state = StateFile(str(tmp_path / "file" / "state"))
+    assert state.save("x").reason == "x"
+    assert state.problem
+
+
+def test_systemd_is_told_ready_status_watchdog_and_stopping(tmp_path: Path) -> None:
+    path = tmp_path / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(path))
+        listener.settimeout(5.0)
+        notifier = SystemdNotifier(str(path))
+        notifier.ready("disarmed")
+        notifier.feed_watchdog()
+        notifier.status("auto")
+        notifier.stopping()
+        said = [listener.recv(200).decode() for _ in range(4)]
+        notifier.close()
+    assert said == ["READY=1\nSTATUS=disarmed", "WATCHDOG=1", "STATUS=auto", "STOPPING=1"]
+
+
+def test_without_systemd_or_with_its_socket_gone_nothing_happens(tmp_path: Path) -> None:
+    SystemdNotifier("").ready("x")
+    notifier = SystemdNotifier(str(tmp_path / "gone"))
+    notifier.feed_watchdog()
+    notifier.close()
+
+
+def recording(directory: Path, **settings: object) -> tuple[Config, Recorder]:
+    config = parse({"recording": {"directory": str(directory), **settings}})
+    return config, Recorder(config)
+
+
+def test_a_recording_begins_with_versions_and_the_resolved_configuration(tmp_path: Path) -> None:
+    config, recorder = recording(tmp_path, min_free_mb=0)
+    for index in range(100):
+        recorder.take(1000.0 + index * 0.02, lambda: STATUS)
+    recorder._write_guarded()
+    assert recorder.path is not None
+    lines = [json.loads(line) for line in recorder.path.read_text(encoding="utf-8").splitlines()]
+    assert lines[0]["event"] == "recording"
+    assert Config.model_validate(lines[0]["config"]) == config
+    assert len(lines) - 1 == pytest.approx(20, abs=1)
+    assert lines[1]["mode"] == "disarmed"
+
+
+def test_a_full_disk_costs_records_and_is_told(tmp_path: Path) -> None:
+    _, recorder = recording(tmp_path, min_free_mb=1e12)
+    recorder.take(1000.0, lambda: STATUS)
+    recorder._write_guarded()
+    (fault,) = recorder.faults(1000.1)
+    assert (fault.device, fault.condition) == ("daemon", "disk_full")
+    assert recorder.path is None
+
+
+def test_a_directory_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    _, recorder = recording(tmp_path / "file" / "sub", min_free_mb=0)
+    recorder.take(1000.0, lambda: STATUS)
+    recorder._write_guarded()
+    assert recorder.faults(1000.1)[0].condition == "recorder_failed"
+
+
+def test_the_oldest_recordings_make_room(tmp_path: Path) -> None:
+    for index in range(5):
+        (tmp_path / f"graderd-2020010{index}T000000Z.jsonl").write_bytes(b"x" * 1_000_000)
+    _, recorder = recording(tmp_path, min_free_mb=0, max_mb=2.5)
+    recorder.take(1000.0, lambda: STATUS)
+    recorder._write_guarded()
+    assert len(list(tmp_path.glob("graderd-2020*.jsonl"))) == 2
+
+
+def test_without_a_directory_nothing_is_recorded() -> None:
+    recorder = Recorder(Config())
+    recorder.take(1.0, lambda: pytest.fail("no status is wanted"))
+    assert recorder.faults(1.0) == ()
+
+
+def test_a_stepped_clock_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    watch = HealthWatch(Config())
+    watch.look()
+    assert watch.faults(time.monotonic()) == ()
+    real = time.time
+    monkeypatch.setattr(time, "time", lambda: real() + 3600.0)
+    watch.look()
+    (fault,) = watch.faults(time.monotonic())
+    assert fault.condition == "clock_stepped"
+    assert "+3600 s" in fault.detail
+    assert watch.faults(time.monotonic() + 60.0) == ()
+
+
+def test_high_memory_is_told() -> None:
+    watch = HealthWatch(parse({"control": {"memory_warn_mb": 1.0}}))
+    watch.look()
+    assert [fault.condition for fault in watch.faults(time.monotonic())] == ["memory_high"]
+
+
+def test_the_angle_at_the_moment_of_exposure() -> None:
+    history = AngleHistory()
+    assert history.at(5.0)[1] == float("inf")
+    for index in range(10):
+        history.add(float(index), 10.0 * index)
+    history.add(3.0, 999.0)
+    angle_deg, age_s = history.at(4.25)
+    assert angle_deg == pytest.approx(42.5)
+    assert age_s == pytest.approx(0.25)
+    assert history.at(9.5) == (90.0, 0.5)
+    assert history.at(-1.0) == (0.0, 1.0)
+
+
+def test_settings_the_camera_did_not_take_are_named() -> None:
+    camera = parse({"camera": {"exposure_us": 8000.0, "white_balance_k": 4600.0}}).camera
+    assert settings_not_kept(camera, {"exposure_us": 8000.0, "white_balance_k": 4600.0}) == ()
+    (wrong,) = settings_not_kept(camera, {"exposure_us": 8000.0, "white_balance_k": 5500.0})
+    assert "white_balance_k" in wrong
+    assert settings_not_kept(camera, {}) == ()
