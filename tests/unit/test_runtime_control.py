@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,7 +32,7 @@ class Bench:
             Config(), self.machine.devices, self.machine.eyes, self.machine.clock, StateFile(str(directory))
         )
 
-    async def ticks(self, count_n: int = 1, zone: Zone | None = None, **shares: float) -> None:
+    async def ticks(self, count_n: int = 1, zone: Zone | None = None, **shares: Any) -> None:
         """Tick ``count_n`` times; with ``zone``, a new observation of it every third tick."""
         for index in range(count_n):
             self.machine.clock.advance(TICK_S)
