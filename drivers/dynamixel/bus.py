@@ -152,6 +152,11 @@ class ServoBus:
             "low_latency_n": int(self.low_latency),
         }
 
+    @property
+    def damaged_n(self) -> int:
+        """Replies that came and were not valid."""
+        return self._decoder.crc_errors_n + self._counters["invalid_n"]
+
     # -- requests -----------------------------------------------------------------------------------------------
 
     async def ping(self, servo_id: int, *, attempts_n: int = 2) -> tuple[int, int]:

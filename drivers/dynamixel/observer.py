@@ -1,0 +1,162 @@
+"""What is known of the servo: newest readings, present faults, and why it is not fit to go on. Reads only."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+from drivers.dynamixel.bus import ServoBus
+from drivers.dynamixel.calibration import Calibration
+from drivers.dynamixel.detectors import MotionDetectors, Sample
+from drivers.dynamixel.device import WATCHDOG_TRIPPED, Ph54Device
+from drivers.dynamixel.faultbook import FaultBook
+from drivers.dynamixel.table import ControlTable
+from graderd.hal.clock import Clock
+from graderd.hal.reading import Reading
+from graderd.hal.rotator import RotatorTelemetry
+from graderd.hal.settings import RotatorSettings
+
+_CORRUPT_N, _CORRUPT_WINDOW_S = 3, 1.0
+MOTION_FAULTS = frozenset(
+    {"not_moving", "wrong_way", "moving_uncommanded", "voltage_near_limit", "temperature_near_limit"}
+)
+
+
+class ServoObserver:
+    """Turns registers into readings and conditions; the rotator decides what follows from them.
+
+    ``torque_on``: as last read. ``tripped``: the servo's bus watchdog has stopped it and is not cleared yet.
+    ``turns_unknown``: whole turns were lost where they matter, the angle is ambiguous until a person confirms it.
+    ``turns_jumped``: the turn count jumped since :meth:`restart`; a goal in counts is worth nothing any more.
+    """
+
+    def __init__(
+        self, device_name: str, settings: RotatorSettings, table: ControlTable, calibration: Calibration, clock: Clock
+    ) -> None:
+        self.telemetry = RotatorTelemetry()
+        self.faults = FaultBook(device_name)
+        self.torque_on = False
+        self.tripped = False
+        self.turns_unknown = False
+        self.turns_jumped = False
+        self.health_s = self.goals_s = float("-inf")
+        self._calibration = calibration
+        self._clock = clock
+        self._alerts = {int(bit, 16): name for bit, name in table.profile["hardware_error"].items()}
+        self._alert_names = frozenset(self._alerts.values())
+        self._detectors = MotionDetectors(settings)
+        self._counts: int | None = None
+        self._damaged_n = 0
+        self._damaged_s: deque[float] = deque(maxlen=64)
+
+    def restart(self, *, position_known: bool = False) -> None:
+        """A servo just found or armed: motion is watched anew. ``position_known``: a jump from the last one counts."""
+        self._detectors.restart()
+        self.turns_jumped = False
+        if not position_known:
+            self._counts = None
+
+    # -- readings ---------------------------------------------------------------------------------------------
+
+    async def read_telemetry(self, device: Ph54Device, goal_deg: float | None, *, attempts_n: int = 1) -> None:
+        """One telemetry block; ``goal_deg`` is what the servo was last told while it is powered by us."""
+        values, alert = await device.read_block(device.telemetry_block, attempts_n=attempts_n)
+        now_s, cal = self._clock.now_s(), self._calibration
+        angle_deg = cal.blade_deg(self._follow_turns(values["present_position"], now_s))
+        velocity = cal.blade_deg_per_s(values["present_velocity"])
+        current_ma, volts = values["present_current"], values["present_input_voltage"] / 10.0
+        celsius = float(values["present_temperature"])
+        self.telemetry = replace(
+            self.telemetry,
+            angle_deg=Reading(angle_deg, now_s, not self.turns_unknown),
+            velocity_deg_per_s=Reading(velocity, now_s),
+            current_a=Reading(cal.sign * current_ma / 1000.0, now_s),
+            torque_nm=Reading(cal.torque_nm(current_ma), now_s),
+            voltage_v=Reading(volts, now_s),
+            temperature_c=Reading(celsius, now_s),
+            moving=Reading(bool(values["moving"]), now_s),
+            in_position=Reading(bool(values["moving_status"] & 1), now_s),
+        )
+        sample = Sample(now_s, angle_deg, velocity, current_ma / 1000.0, volts, celsius, goal_deg)
+        self.faults.replace(MOTION_FAULTS, self._detectors.look(sample), now_s)
+        if alert and not any(name in self.faults for name in self._alert_names):
+            self.health_s = float("-inf")  # read it next
+
+    def _follow_turns(self, counts: int, now_s: float) -> int:
+        """Notice a jump by whole turns; returns the count to go by."""
+        turn, extended = self._calibration.pulses_per_turn, self._calibration.needs_turns
+        before, self._counts = self._counts, counts
+        if before is not None and abs(counts - before) > turn // 2:
+            self.turns_jumped = True
+            detail = f"the servo's turn count jumped by {round((counts - before) / turn):+d}"
+            if extended:
+                self.turns_unknown = True
+                self.faults.set("turns_lost", f"{detail}: confirm the blade's angle", now_s)
+            else:
+                self.faults.event("turns_lost", f"{detail}; the angle within one turn is known", now_s)
+        return counts if extended else (counts + turn // 2) % turn - turn // 2
+
+    async def read_health(self, device: Ph54Device, *, attempts_n: int = 1) -> None:
+        """Torque and hardware error."""
+        self.health_s = now_s = self._clock.now_s()
+        health, _ = await device.read_block(device.health_block, attempts_n=attempts_n)
+        bits = health["hardware_error_status"]
+        present = {
+            name: f"hardware error bit 0x{bit:02X} is set (status 0x{bits:02X}); cleared by a reboot of the servo only"
+            for bit, name in self._alerts.items()
+            if bits & bit
+        }
+        self.faults.replace(self._alert_names, present, now_s)
+        self.set_torque(bool(health["torque_enable"]))
+
+    async def read_goals(self, device: Ph54Device, *, attempts_n: int = 1) -> dict[str, int]:
+        """Watchdog, profile and goal registers; a trip is told once, however long the register stays tripped."""
+        self.goals_s = now_s = self._clock.now_s()
+        goals, _ = await device.read_block(device.goal_block, attempts_n=attempts_n)
+        tripped = goals["bus_watchdog"] == WATCHDOG_TRIPPED
+        if tripped and not self.tripped:
+            self.faults.event("watchdog_tripped", "the servo's bus watchdog has stopped it; arm again", now_s)
+        self.tripped = tripped
+        return goals
+
+    def set_torque(self, on: bool) -> None:
+        """Torque as it was written or read."""
+        self.torque_on = on
+        self.telemetry = replace(self.telemetry, torque_on=Reading(on, self._clock.now_s()))
+
+    def note_sent(self, counts: int) -> None:
+        """A goal was taken by the servo."""
+        sent = Reading(self._calibration.blade_deg(counts), self._clock.now_s())
+        self.telemetry = replace(self.telemetry, goal_sent_deg=sent)
+
+    # -- judgement --------------------------------------------------------------------------------------------
+
+    def name_torque_loss(self, goals: dict[str, int]) -> None:
+        """Torque that was ours is off: say why, as far as the registers tell."""
+        now_s = self._clock.now_s()
+        if any(name in self.faults for name in self._alert_names):
+            return
+        if goals["bus_watchdog"] == 0:
+            self.faults.event("ram_reset", "the servo's RAM registers were reset: its power was cut", now_s)
+        else:
+            self.faults.event("torque_off", "torque was found switched off", now_s)
+
+    def count_damage(self, bus: ServoBus) -> None:
+        """Several damaged replies within a second are a fault even where others get through."""
+        now_s, damaged_n = self._clock.now_s(), bus.damaged_n
+        self._damaged_s.extend([now_s] * min(max(0, damaged_n - self._damaged_n), 8))
+        self._damaged_n = damaged_n
+        recent_n = sum(1 for at_s in self._damaged_s if now_s - at_s <= _CORRUPT_WINDOW_S)
+        if recent_n >= _CORRUPT_N:
+            self.faults.set("corrupt_replies", f"{recent_n} damaged replies within {_CORRUPT_WINDOW_S:g} s", now_s)
+        else:
+            self.faults.clear("corrupt_replies")
+
+    def damaged_lately(self) -> bool:
+        """Whether a lost connection was damaged replies rather than silence."""
+        return bool(self._damaged_s) and self._clock.now_s() - self._damaged_s[-1] < 2 * _CORRUPT_WINDOW_S
+
+    def new_wire(self) -> None:
+        """The damage of another connection does not count."""
+        self._damaged_n = 0
+        self._damaged_s.clear()
