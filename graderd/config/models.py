@@ -10,6 +10,7 @@ from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.core.attitude import AttitudeGeometry, Preset
 from graderd.core.blade import BladeGeometry
 from graderd.core.gate import GateSettings
+from graderd.core.lift_pair import LiftPairSettings
 from graderd.core.machine import MachineSettings
 from graderd.core.rule import RuleSettings
 from graderd.hal.settings import (
@@ -111,6 +112,7 @@ class Config(Settings):
     lift_right: ActuatorSettings = Field(default_factory=_lift_right)
     tilt: ActuatorSettings = Field(default_factory=_tilt)
     attitude: AttitudeGeometry = Field(default_factory=AttitudeGeometry)
+    lift_pair: LiftPairSettings = Field(default_factory=LiftPairSettings)
     rule: RuleSettings = Field(default_factory=RuleSettings)
     gate: GateSettings = Field(default_factory=GateSettings)
     machine: MachineSettings = Field(default_factory=MachineSettings)

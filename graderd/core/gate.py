@@ -1,7 +1,8 @@
 """The gate: the only way out. Every goal passes here, or the axis stays where it is.
 
 Order of the checks, the first that fails decides: mode, lease, finite number, fresh measurement, interlocks, then the
-bounds (absolute limits and the working window around the armed pose) and the motion limits (speed and acceleration).
+bounds (absolute limits and the working window around the armed pose) and the motion limits (speed, acceleration, and
+how far the goal may run ahead of the measured position).
 A goal beyond a bound is not "corrected": it is limited to the bound and the result says so.
 """
 
@@ -27,6 +28,7 @@ class AxisLimits(Settings):
     window: Positive = Field(description="largest distance from where the axis stood when it was armed")
     speed: Positive = Field(description="largest speed of the goal, per second")
     acceleration: Positive = Field(description="largest change of that speed, per second squared")
+    lead: Positive = Field(description="largest distance of the goal ahead of the measured position")
 
     @model_validator(mode="after")
     def _order(self) -> AxisLimits:
@@ -43,16 +45,19 @@ class GateSettings(Settings):
     rotation_window_deg: Positive = 120.0
     rotation_speed_deg_per_s: Positive = 25.0
     rotation_acceleration_deg_per_s2: Positive = 50.0
+    rotation_lead_deg: Positive = Field(10.0, description="how far the goal may run ahead of a blade that is held back")
     lift_min_mm: NotNegative = 5.0
     lift_max_mm: Positive = 295.0
     lift_window_mm: Positive = 290.0
     lift_speed_mm_per_s: Positive = 60.0
     lift_acceleration_mm_per_s2: Positive = 200.0
+    lift_lead_mm: Positive = 30.0
     tilt_min_mm: NotNegative = 3.0
     tilt_max_mm: Positive = 97.0
     tilt_window_mm: Positive = 94.0
     tilt_speed_mm_per_s: Positive = 25.0
     tilt_acceleration_mm_per_s2: Positive = 100.0
+    tilt_lead_mm: Positive = 15.0
     rotation_min_height_mm: Finite | None = Field(
         None, description="no rotation while the cutting edge is lower than this; None: no such interlock"
     )
@@ -65,6 +70,7 @@ class GateSettings(Settings):
             window=self.lift_window_mm,
             speed=self.lift_speed_mm_per_s,
             acceleration=self.lift_acceleration_mm_per_s2,
+            lead=self.lift_lead_mm,
         )
         return {
             "rotation": AxisLimits(
@@ -73,6 +79,7 @@ class GateSettings(Settings):
                 window=self.rotation_window_deg,
                 speed=self.rotation_speed_deg_per_s,
                 acceleration=self.rotation_acceleration_deg_per_s2,
+                lead=self.rotation_lead_deg,
             ),
             "lift_left": lift,
             "lift_right": lift,
@@ -82,6 +89,7 @@ class GateSettings(Settings):
                 window=self.tilt_window_mm,
                 speed=self.tilt_speed_mm_per_s,
                 acceleration=self.tilt_acceleration_mm_per_s2,
+                lead=self.tilt_lead_mm,
             ),
         }
 
@@ -151,7 +159,7 @@ def pass_gate(state: GateState, goals: Goals, inputs: GateInputs) -> tuple[GateS
             passed[axis] = AxisPass(requested, None, refusal)
             continue
         bounded, why = _bound(requested, limits[axis], former.armed_at)
-        setpoints[axis] = _advance(former, bounded, limits[axis], inputs.dt_s)
+        setpoints[axis] = _leash(_advance(former, bounded, limits[axis], inputs.dt_s), measured, limits[axis])
         passed[axis] = AxisPass(requested, setpoints[axis].position, why)
     return GateState(setpoints), passed
 
@@ -212,6 +220,14 @@ def _advance(former: Setpoint, goal: float, limits: AxisLimits, dt_s: float) -> 
     if arrived:
         return replace(former, position=goal, speed=0.0)
     return replace(former, position=position, speed=speed)
+
+
+def _leash(setpoint: Setpoint, measured: float, limits: AxisLimits) -> Setpoint:
+    """Keep the setpoint near the measured position: what jams and comes free must not jump after a far goal."""
+    if abs(setpoint.position - measured) <= limits.lead:
+        return setpoint
+    position = measured + math.copysign(limits.lead, setpoint.position - measured)
+    return replace(setpoint, position=min(max(position, limits.low), limits.high), speed=0.0)
 
 
 def _goal_of(goals: Goals, axis: str) -> float | None:

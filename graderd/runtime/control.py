@@ -13,7 +13,8 @@ from graderd.core import commands as cmd
 from graderd.core.fault_catalogue import CATALOGUE
 from graderd.core.faults import Clear, FaultState, clear_faults, update_faults
 from graderd.core.gate import AxisPass, GateInputs, GateState, pass_gate
-from graderd.core.lift import LiftCoordinator
+from graderd.core.lift import LiftCoordinator, height_mm
+from graderd.core.lift_pair import SideReading
 from graderd.core.machine import ARMED, Goals, Inputs, Intents, Mode, Pose, State, step
 from graderd.core.motion import resolve
 from graderd.core.zones import SoilObservation
@@ -81,14 +82,12 @@ class ControlLoop:
         self._clock = clock
         self._state_file = state_file
         self._gate = GateState()
-        self._lift = LiftCoordinator(config.attitude)
+        self._lift = LiftCoordinator(config.lift_pair)
         self._power = PowerKeeper(devices)
         self._queue: deque[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = deque()
-        self._wake = asyncio.Event()
         self._moving: set[str] = set()
         self._late: tuple[float, float] | None = None
         self._lapse: tuple[str, float] | None = None
-        self._hold_failed: tuple[str, ...] = ()
 
     # ---- commands -------------------------------------------------------------------------------------------------
 
@@ -102,11 +101,8 @@ class ControlLoop:
 
     def stop_now(self, command: cmd.Stop) -> cmd.Reply:
         """Stop without waiting for a tick: hold on every wire now, then latch."""
-        self._hold_failed = self.devices.hold_all()
-        self._moving.clear()
-        reply = self._step((command,))[0]
-        self._wake.set()
-        return reply
+        self._hold_all()
+        return self._step((command,))[0]
 
     # ---- the tick -------------------------------------------------------------------------------------------------
 
@@ -177,7 +173,9 @@ class ControlLoop:
     def _act(self, dt_s: float, pose: Pose) -> None:
         """Pass the gate and hand what may be sent to the drivers."""
         self._power.want(self.intents.power)
-        goals, shares = self._lift.step(self.intents.goals, pose)
+        goals, shares = self._lift.step(
+            self.intents.goals, self.time_s, self._side("lift_left"), self._side("lift_right")
+        )
         self._gate, self.passed = pass_gate(
             self._gate,
             goals,
@@ -187,7 +185,7 @@ class ControlLoop:
                 pose=pose,
                 dt_s=dt_s,
                 lease_ok=self.state.mode is Mode.AUTO or self.state.lease is not None,
-                height_mm=self._lift.height_mm(pose),
+                height_mm=height_mm(self.config.attitude, pose),
             ),
         )
         for axis, result in self.passed.items():
@@ -210,6 +208,16 @@ class ControlLoop:
         else:
             self._moving.add(axis)
             self.devices.actuators[axis].set_target_mm(limited, speed_share)
+
+    def _hold_all(self) -> None:
+        """The stop path: every axis is told, whatever one of the drivers does."""
+        for name in self.devices.hold_all():
+            log.error("%s: its driver failed to take the hold; its own dead man ends the motion", name)
+        self._moving.clear()
+
+    def _side(self, name: str) -> SideReading | None:
+        reading = self.devices.actuators[name].telemetry().position_mm
+        return SideReading(reading.value, reading.time_s) if reading is not None and reading.valid else None
 
     def _hold(self, axis: str) -> None:
         """Once: a hold renewed every tick would follow every bit of measured drift."""
@@ -234,14 +242,17 @@ class ControlLoop:
         )
 
     def _settled(self, pose: Pose) -> bool:
-        """Whether every axis with a goal stands at what the gate lets it have."""
+        """Whether every axis with a goal stands at it, or at the bound the gate lets it have."""
+        control = self.config.control
         for axis, result in self.passed.items():
-            if result.requested is None or result.limited is None:
+            rotation = axis == "rotation"
+            goals = self.intents.goals
+            wanted = goals.rotation_deg if rotation else getattr(goals, f"{axis}_mm")
+            if wanted is None:
                 continue
-            measured = pose.rotation_deg if axis == "rotation" else getattr(pose, f"{axis}_mm")
-            control = self.config.control
-            tolerance = control.rotation_tolerance_deg if axis == "rotation" else control.actuator_tolerance_mm
-            goal = result.requested if not result.reason else result.limited
+            measured = pose.rotation_deg if rotation else getattr(pose, f"{axis}_mm")
+            tolerance = control.rotation_tolerance_deg if rotation else control.actuator_tolerance_mm
+            goal = result.limited if result.reason and result.limited is not None else wanted
             if measured is None or abs(measured - goal) > tolerance:
                 return False
         return True
@@ -250,7 +261,7 @@ class ControlLoop:
         return {axis: (limit.low, limit.high) for axis, limit in self.config.gate.limits().items()}
 
     def _present_faults(self, now_s: float) -> list[DeviceFault]:
-        found: list[DeviceFault] = [*self.devices.link.faults(), *self._eyes.faults()]
+        found: list[DeviceFault] = [*self.devices.link.faults(), *self._eyes.faults(), *self._lift.faults()]
         for device in self.devices.all().values():
             found.extend(device.faults())
         for source in self.extra_faults:
@@ -270,8 +281,7 @@ class ControlLoop:
             return
         log.info("%s -> %s: %s", before.mode, after.mode, after.reason)
         if after.mode is Mode.STOPPED:
-            self._hold_failed = self.devices.hold_all()
-            self._moving.clear()
+            self._hold_all()
             self.last_stop = self._state_file.save(after.reason)
         elif after.mode in ARMED and before.mode not in ARMED:
             self._gate = GateState()

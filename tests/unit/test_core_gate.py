@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graderd.core.gate import AXES, AxisLimits, GateInputs, GateSettings, GateState, pass_gate
+from graderd.core.gate import AXES, AxisLimits, GateInputs, GateSettings, GateState, Setpoint, pass_gate
 from graderd.core.machine import ARMED, Goals, Mode, Pose
 
 SETTINGS = GateSettings()
@@ -185,6 +185,30 @@ def test_a_measurement_lost_in_motion_holds_and_keeps_the_armed_pose() -> None:
     assert state.setpoints["rotation"].armed_at == 0.0
 
 
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_jammed_axis_is_not_led_far(axis: str, sign: float) -> None:
+    limits = SETTINGS.limits()[axis]
+    start = getattr(POSE, FIELDS[axis])
+    wanted = limits.high if sign > 0 else limits.low
+    seen = [tick[axis] for tick in drive(goal(axis, wanted), inputs(), 400, follow=False)]
+    leads = [abs(value - start) for value in seen if value is not None]
+    assert max(leads) == pytest.approx(limits.lead)
+    for offset in (-1e-6, 0.0, 1e-6):
+        setpoint = Setpoint(start + sign * (limits.lead + offset), 0.0, start)
+        _, passed = pass_gate(GateState({axis: setpoint}), goal(axis, wanted), inputs(dt_s=1e-9))
+        limited = passed[axis].limited
+        assert limited is not None
+        assert abs(limited - start) <= limits.lead
+
+
+def test_the_leash_never_leads_outside_the_limits() -> None:
+    outside = replace(POSE, rotation_deg=75.0)
+    state = GateState({"rotation": Setpoint(60.0, 0.0, 0.0)})
+    _, passed = pass_gate(state, goal("rotation", 0.0), inputs(pose=outside))
+    assert passed["rotation"].limited == 60.0
+
+
 def test_no_time_no_motion() -> None:
     state, _ = pass_gate(GateState(), goal("rotation", 40.0), inputs())
     after, passed = pass_gate(state, goal("rotation", 40.0), inputs(dt_s=0.0))
@@ -208,6 +232,6 @@ def test_armed_modes_move(mode: Mode) -> None:
 
 def test_limits_in_the_wrong_order_are_refused() -> None:
     with pytest.raises(ValueError, match="below"):
-        AxisLimits(low=1.0, high=1.0, window=1.0, speed=1.0, acceleration=1.0)
+        AxisLimits(low=1.0, high=1.0, window=1.0, speed=1.0, acceleration=1.0, lead=1.0)
     with pytest.raises(ValueError, match="below"):
         GateSettings(rotation_min_deg=10.0, rotation_max_deg=-10.0)
