@@ -67,7 +67,7 @@ def _size(value: Any) -> tuple[int, int] | None:
     width, height = (int(part) for part in value)
     if width == 0 and height == 0:
         return None
-    if not (width >= 64 and height >= 48 and width * height <= _MAX_PIXELS):
+    if not (64 <= width <= 2048 and 48 <= height <= 2048 and width * height <= _MAX_PIXELS):
         raise ValueError(f"a picture of {width} x {height} pixels cannot be made")
     return width, height
 
