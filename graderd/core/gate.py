@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 from pydantic import Field, model_validator
 
@@ -62,41 +63,46 @@ class GateSettings(Settings):
         None, description="no rotation while the cutting edge is lower than this; None: no such interlock"
     )
 
-    def limits(self) -> dict[str, AxisLimits]:
+    def limits(self) -> Mapping[str, AxisLimits]:
         """The limits by axis name."""
-        lift = AxisLimits(
-            low=self.lift_min_mm,
-            high=self.lift_max_mm,
-            window=self.lift_window_mm,
-            speed=self.lift_speed_mm_per_s,
-            acceleration=self.lift_acceleration_mm_per_s2,
-            lead=self.lift_lead_mm,
-        )
-        return {
-            "rotation": AxisLimits(
-                low=self.rotation_min_deg,
-                high=self.rotation_max_deg,
-                window=self.rotation_window_deg,
-                speed=self.rotation_speed_deg_per_s,
-                acceleration=self.rotation_acceleration_deg_per_s2,
-                lead=self.rotation_lead_deg,
-            ),
-            "lift_left": lift,
-            "lift_right": lift,
-            "tilt": AxisLimits(
-                low=self.tilt_min_mm,
-                high=self.tilt_max_mm,
-                window=self.tilt_window_mm,
-                speed=self.tilt_speed_mm_per_s,
-                acceleration=self.tilt_acceleration_mm_per_s2,
-                lead=self.tilt_lead_mm,
-            ),
-        }
+        return _limits_of(self)
 
     @model_validator(mode="after")
     def _build(self) -> GateSettings:
         self.limits()
         return self
+
+
+@lru_cache(maxsize=8)
+def _limits_of(settings: GateSettings) -> dict[str, AxisLimits]:
+    lift = AxisLimits(
+        low=settings.lift_min_mm,
+        high=settings.lift_max_mm,
+        window=settings.lift_window_mm,
+        speed=settings.lift_speed_mm_per_s,
+        acceleration=settings.lift_acceleration_mm_per_s2,
+        lead=settings.lift_lead_mm,
+    )
+    return {
+        "rotation": AxisLimits(
+            low=settings.rotation_min_deg,
+            high=settings.rotation_max_deg,
+            window=settings.rotation_window_deg,
+            speed=settings.rotation_speed_deg_per_s,
+            acceleration=settings.rotation_acceleration_deg_per_s2,
+            lead=settings.rotation_lead_deg,
+        ),
+        "lift_left": lift,
+        "lift_right": lift,
+        "tilt": AxisLimits(
+            low=settings.tilt_min_mm,
+            high=settings.tilt_max_mm,
+            window=settings.tilt_window_mm,
+            speed=settings.tilt_speed_mm_per_s,
+            acceleration=settings.tilt_acceleration_mm_per_s2,
+            lead=settings.tilt_lead_mm,
+        ),
+    }
 
 
 @dataclass(frozen=True, slots=True)
