@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
-MODULES: Final = ("can", "can-raw", "can-j1939", "vcan", "slcan")
+MODULES: Final = ("can", "can-raw", "can-j1939", "can-gw", "vcan", "slcan")
 EXTENDED: Final = 0x8000_0000
 ERROR: Final = 0x2000_0000
 ADDRESS_CLAIMED: Final = 0xEE00
@@ -185,6 +185,12 @@ class KernelNode:
             if pgn in (None, got_pgn) and source in (None, got_source):
                 return Received(data, got_pgn, got_source, name)
         return None
+
+
+def couple(one: str, other: str) -> None:
+    """Let every frame of one interface appear on the other, by the kernel's CAN gateway; ends with either of them."""
+    for source, destination in ((one, other), (other, one)):
+        subprocess.run(["cangw", "-A", "-s", source, "-d", destination, "-e"], check=True)
 
 
 @contextlib.contextmanager

@@ -1,0 +1,161 @@
+"""Hardware in the loop: the installed package as a service on the CAN of a running kernel, the rig on the far side.
+
+::
+
+    graderd.service ── vcan0 ══ kernel gateway ══ wire0 ── rig (actuators)
+                    └─ pty ─────────────────────────────── rig (servo)
+                    └─ unix socket ─────────────────────── rig (camera)
+
+Started by ``python3 -m hil.suite``. After every test: no error frame, no restart and no core dump that the test did
+not announce with ``error_frames`` or ``restarts(n)``; at the end: no socket or task more than at the beginning.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hil import bus
+from hil.service import Grader, Rig, run
+
+WIRE = "wire0"
+CAN = "vcan0"
+CORES = Path("/var/tmp/hil-cores")
+DROP_IN = Path("/etc/systemd/system/graderd.service.d")
+SMALL_PICTURES: dict[str, object] = {
+    "camera.color_width_px": 640,
+    "camera.color_height_px": 400,
+    "camera.depth_width_px": 424,
+    "camera.depth_height_px": 240,
+    "camera.rate_hz": 5.0,
+}
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The suite's own marks."""
+    config.addinivalue_line("markers", "error_frames: the test makes the bus report errors")
+    config.addinivalue_line("markers", "restarts(n): systemd restarts the service so often during the test")
+    config.addinivalue_line("markers", "soak: the long run with faults")
+    config.addinivalue_line("markers", "shutdown: leaves the machine as it is, for the shutdown that follows")
+
+
+def pytest_report_header() -> list[str]:
+    """Which kernel and which kind of bus this is about."""
+    where = os.environ.get("HIL_GUEST", "")
+    kind = {"uml": "user-mode Linux guest", "qemu": "QEMU guest"}.get(where, "this machine")
+    return [
+        f"hil: kernel {platform.release()} ({kind}), bus: the kernel's SocketCAN, vcan and slcan, can-j1939",
+        f"hil: package {run('dpkg-query', '-W', 'graderd', check=False).stdout.strip() or 'not installed'}",
+    ]
+
+
+@pytest.fixture(scope="session")
+def wire() -> Iterator[str]:
+    """The bus: the rig's end and the service's end, coupled."""
+    bus.load_modules()
+    with bus.vcan(WIRE), bus.vcan(CAN):
+        bus.couple(CAN, WIRE)
+        yield WIRE
+
+
+@pytest.fixture(scope="session")
+def rig(wire: str) -> Iterator[Rig]:
+    """The simulated grader."""
+    machine = Rig(wire, seed=int(os.environ.get("GRADERD_HIL_SEED", "0")))
+    machine.start()
+    yield machine
+    machine.stop()
+
+
+@pytest.fixture(scope="session")
+def service(rig: Rig) -> Iterator[Grader]:
+    """The installed service, running and disarmed."""
+    CORES.mkdir(exist_ok=True)
+    pattern = Path("/proc/sys/kernel/core_pattern")
+    former_pattern = pattern.read_text(encoding="ascii")
+    pattern.write_text(f"{CORES}/%e.%p", encoding="ascii")
+    DROP_IN.mkdir(parents=True, exist_ok=True)
+    # The guest has one processor: the drop-in we ship for that. And its page faults are slow: keep memory once taken.
+    (DROP_IN / "realtime.conf").write_bytes(Path("/usr/share/graderd/dropins/realtime.conf").read_bytes())
+    (DROP_IN / "hil.conf").write_text(
+        "[Service]\nEnvironment=MALLOC_TRIM_THRESHOLD_=1000000000 MALLOC_MMAP_THRESHOLD_=1000000000\n", encoding="utf-8"
+    )
+    grader = Grader()
+    grader.configure(rig.configuration() | SMALL_PICTURES | {"can.channel": CAN})
+    run("systemctl", "daemon-reload")
+    grader.start()
+    before = _descriptors(grader)
+    yield grader
+    if os.environ.get("HIL_SHUTDOWN"):
+        return
+    after = _descriptors(grader) if grader.unit.pid else {}
+    grader.unit.ctl("stop")
+    assert grader.unit.show("Result") == "success", grader.unit.journal()
+    pattern.write_text(former_pattern, encoding="ascii")
+    assert after.get("socket", 0) <= before["socket"] + 1, f"sockets leaked: {before} -> {after}"
+    assert not _bus_users(CAN), _bus_users(CAN)
+    assert not Path("/run/graderd").exists()
+
+
+@pytest.fixture(autouse=True)
+def quiet(request: pytest.FixtureRequest, service: Grader) -> Iterator[None]:
+    """Each test begins disarmed with the machine at rest, and ends with nothing unasked."""
+    watch = bus.RawBus("", only_errors=True)
+    restarts = request.node.get_closest_marker("restarts")
+    allowed = restarts.args[0] if restarts else 0
+    before = service.unit.restarts_n
+    pid = service.unit.pid
+    yield
+    errors = watch.drain()
+    watch.close()
+    if request.node.get_closest_marker("shutdown"):
+        return
+    if not request.node.get_closest_marker("error_frames"):
+        assert not errors, f"error frames unasked: {errors[:5]}"
+    assert service.unit.restarts_n - before == allowed, service.unit.journal()
+    assert allowed or service.unit.pid == pid or service.unit.show("NRestarts") == "0", "the service was replaced"
+    assert not list(CORES.iterdir())
+
+
+@pytest.fixture
+def ready(service: Grader, rig: Rig) -> Iterator[Grader]:
+    """The service, disarmed and ready to be armed; disarmed again afterwards."""
+    rig.ask("clear_faults")
+    service.disarm()
+    service.wait_ready()
+    yield service
+    if service.unit.state == "active":
+        service.disarm()
+    rig.ask("clear_faults")
+
+
+@pytest.fixture
+def listener(wire: str) -> Iterator[bus.RawBus]:
+    """A raw socket on the rig's end of the bus."""
+    raw = bus.RawBus(wire)
+    yield raw
+    raw.close()
+
+
+def _descriptors(grader: Grader) -> dict[str, int]:
+    kinds: dict[str, int] = {}
+    for entry in Path(f"/proc/{grader.unit.pid}/fd").iterdir():
+        try:
+            kind = entry.readlink().name.split(":")[0] or "other"
+        except FileNotFoundError:
+            continue
+        kinds[kind] = kinds.get(kind, 0) + 1
+    return kinds
+
+
+def _bus_users(interface: str) -> list[str]:
+    """Receive lists of the kernel that still hold an entry on this interface, apart from the gateway's."""
+    found = []
+    for path in Path("/proc/net/can").glob("rcvlist_*"):
+        lines = path.read_text(encoding="ascii").splitlines()
+        found += [line for line in lines if line.split()[:1] == [interface] and "gw" not in line.split()[-1]]
+    return found

@@ -1,0 +1,194 @@
+"""The bus side against peers we did not write: the kernel's J1939 stack and can-utils."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+import pytest
+
+from hil.bus import ADDRESS_CLAIMED, KernelNode, RawBus
+from hil.service import Grader, Rig, faults, run, wait_for
+
+WIRE = "wire0"
+OURS = 0xE7
+LIFT_LEFT = 0x13
+ACM = 0xEF00
+COMPONENT_ID = 65259
+SOFTWARE_ID = 65242
+COMMANDED_ADDRESS = 65240
+ACKNOWLEDGE = 0xE800
+STOP_PGN = 0xFF77
+# Identity 2, arbitrary address capable, otherwise zero: below any NAME the daemon has by default.
+LOW_NAME = 0x8000_0000_0000_0002
+HIGH_NAME = 0xF000_0000_0000_0002
+
+
+@contextmanager
+def node(address: int, *, name: int = 0) -> Iterator[KernelNode]:
+    """A node on the kernel's stack, at the rig's end of the bus."""
+    peer = KernelNode(WIRE, address, name=name)
+    try:
+        yield peer
+    finally:
+        peer.close()
+
+
+def our_claim(listener: RawBus, timeout_s: float = 3.0) -> tuple[int, int]:
+    """Address and NAME of the next claim that is the daemon's (industry group 3: construction)."""
+    until_s = time.monotonic() + timeout_s
+    while time.monotonic() < until_s:
+        frame = listener.receive(0.2)
+        if frame is not None and frame.pgn == ADDRESS_CLAIMED and len(frame.data) == 8:
+            name = int.from_bytes(frame.data, "little")
+            if (name >> 60) & 7 == 3:
+                return frame.source, name
+    raise AssertionError(f"no claim of the daemon within {timeout_s:g} s")
+
+
+def control_sources(listener: RawBus, seconds: float) -> set[int]:
+    """Source addresses of the actuator control messages within ``seconds``."""
+    return {f.source for f in listener.frames(seconds) if f.pgn == ACM}
+
+
+def test_it_answers_the_kernels_request_for_claims(ready: Grader, listener: RawBus) -> None:
+    with node(0x80) as peer:
+        peer.request(ADDRESS_CLAIMED)
+        address, name = our_claim(listener)
+    assert address == OURS
+    assert name >> 63 == 1
+    assert (name >> 40) & 0xFF == 132  # land levelling supervisor
+
+
+def test_long_messages_cross_to_and_from_the_kernel(ready: Grader) -> None:
+    """Component identification is longer than 8 bytes: RTS/CTS when asked directly, BAM when asked globally."""
+    with node(0x80) as peer, node(0x81) as bystander:
+        peer.request(COMPONENT_ID, OURS)
+        direct = peer.receive(5.0, pgn=COMPONENT_ID, source=OURS)
+        assert direct is not None
+        assert direct.data.startswith(b"graderd*blade controller*")
+        bystander.request(COMPONENT_ID)
+        broadcast = bystander.receive(5.0, pgn=COMPONENT_ID, source=OURS)
+        assert broadcast is not None
+        assert broadcast.data == direct.data
+        peer.request(SOFTWARE_ID, OURS)
+        software = peer.receive(5.0, pgn=SOFTWARE_ID, source=OURS)
+        assert software is not None
+        assert b"*" in software.data
+
+
+def test_what_it_does_not_know_it_refuses(ready: Grader) -> None:
+    with node(0x80) as peer:
+        peer.request(65253, OURS)  # engine hours
+        answer = peer.receive(3.0, pgn=ACKNOWLEDGE, source=OURS)
+    assert answer is not None
+    assert answer.data[0] == 1
+    assert int.from_bytes(answer.data[5:8], "little") == 65253
+
+
+def test_it_defends_its_address_against_a_lower_priority(ready: Grader, listener: RawBus) -> None:
+    with node(OURS, name=HIGH_NAME) as thief:
+        listener.drain()
+        thief.claim()
+        assert our_claim(listener)[0] == OURS
+
+        def lost() -> bool:
+            try:
+                thief.send(0xFEF1, bytes(8))
+            except OSError as error:
+                return "assign" in str(error)
+            return False
+
+        wait_for("the kernel's stack to give the address up", lost, 2.0)
+        assert control_sources(listener, 0.5) == {OURS}
+
+
+def test_it_moves_away_from_a_higher_priority_and_goes_on(ready: Grader, listener: RawBus) -> None:
+    with ExitStack() as stack:
+        winner = stack.enter_context(node(OURS, name=LOW_NAME))
+        listener.drain()
+        winner.claim()
+        moved_to, _ = our_claim(listener)
+        assert moved_to not in (OURS, 0xFE)
+        time.sleep(0.5)
+        winner.send(0xFEF1, bytes(8))  # the address is the kernel's now
+        listener.drain()
+        assert control_sources(listener, 0.5) == {moved_to}
+        state = ready.wait("all axes readable", lambda s: s["axes"]["tilt"]["lifecycle"] == "standby", 5.0)
+        assert state["mode"] == "disarmed"
+    # A restart asks for the preferred address again.
+    ready.start()
+    with node(0x80) as peer:
+        listener.drain()
+        peer.request(ADDRESS_CLAIMED)
+        assert our_claim(listener)[0] == OURS
+
+
+def test_can_utils_read_and_write_the_same_bus(ready: Grader, rig: Rig, listener: RawBus) -> None:
+    dump = subprocess.run(
+        ["timeout", "3", "candump", "-n", "30", "-L", WIRE], capture_output=True, text=True, check=False
+    )
+    seen = {line.split()[2].split("#")[0] for line in dump.stdout.splitlines()}
+    assert {"18EF13E7", "18EF14E7", "18EF1BE7", "19EFFF13", "19EFFF14", "19EFFF1B"} <= seen
+    spy = subprocess.run(
+        ["timeout", "3", "j1939spy", "-P", "-b", "64", f"{WIRE}:"], capture_output=True, text=True, check=False
+    )
+    assert "1ef" in spy.stdout.lower(), spy
+    # testj1939 at address 0x90 sends a request for the component identification and prints the answer.
+    receiver = subprocess.Popen(
+        ["timeout", "6", "testj1939", "-r", "-w5", f"{WIRE}:0x90"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    time.sleep(0.5)
+    run("cansend", WIRE, f"18EA{OURS:02X}90#{COMPONENT_ID.to_bytes(3, 'little').hex().upper()}")
+    said = receiver.communicate(timeout=10)[0]
+    assert "67 72 61 64 65 72 64" in said.lower(), said  # "graderd"
+
+
+def test_a_claiming_daemon_of_can_utils_lives_beside_it(ready: Grader, listener: RawBus) -> None:
+    daemon = subprocess.Popen(
+        ["j1939acd", "-v", "-r", f"{OURS},{OURS - 1}", "-c", "/tmp/hil.jacd", "f000000000000007", WIRE],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    try:
+        until_s = time.monotonic() + 6.0
+        taken = None
+        while taken is None and time.monotonic() < until_s:
+            frame = listener.receive(0.2)
+            if frame and frame.pgn == ADDRESS_CLAIMED and frame.data == bytes.fromhex("07000000000000f0"):
+                taken = frame.source if frame.source != OURS else None
+        assert taken == OURS - 1, "our address was defended, the other one is theirs"
+    finally:
+        daemon.terminate()
+        daemon.communicate(timeout=5)
+    assert not faults(ready.api.status()) - {"can.address_conflict"}
+
+
+@pytest.fixture
+def with_stop_message(service: Grader, ready: Grader) -> Iterator[Grader]:
+    """The service with a stop PGN of our choice that obeys a commanded address."""
+    service.configure({"can.stop_pgn_n": STOP_PGN, "can.obey_commanded_address": True})
+    service.start()
+    yield service
+    service.configure({"can.obey_commanded_address": False})
+
+
+def test_a_stop_message_stops_and_a_commanded_address_is_taken(with_stop_message: Grader, listener: RawBus) -> None:
+    grader = with_stop_message
+    with node(0x80) as peer:
+        listener.drain()
+        peer.request(ADDRESS_CLAIMED)
+        _, name = our_claim(listener)
+        # 9 bytes: the kernel sends it as BAM.
+        peer.send(COMMANDED_ADDRESS, name.to_bytes(8, "little") + bytes([0xC1]))
+        assert our_claim(listener, 5.0)[0] == 0xC1
+        listener.drain()
+        assert control_sources(listener, 0.5) == {0xC1}
+    grader.arm("manual")
+    run("cansend", WIRE, f"18{STOP_PGN:04X}80#0000000000000000")
+    state = grader.wait("stopped by the bus", lambda s: s["mode"] == "stopped", 2.0)
+    assert "PGN" in state["reason"] or "stop" in state["reason"]

@@ -1,0 +1,32 @@
+"""The last test: the machine is turning when the computer is told to shut down. The verdict is read afterwards.
+
+``hil.suite`` runs this alone, then lets the guest shut down in the ordinary, ordered way. What the bus and the rig
+saw until the end is written to the result directory; :mod:`hil.shutdown` judges it outside.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from hil.service import Grader, Rig, run
+from tests.hil.test_hil_5_life import turn
+
+OUT = Path(os.environ.get("HIL_OUT", "/tmp"))
+
+
+@pytest.mark.shutdown
+def test_shutdown_while_turning(ready: Grader, rig: Rig) -> None:
+    run(
+        "systemd-run",
+        "--quiet",
+        "--unit=hil-witness.service",
+        "--property=Before=graderd.service",
+        f"--property=WorkingDirectory={Path.cwd()}",
+        *(sys.executable, "-m", "hil.shutdown", "watch", "wire0", str(OUT / "shutdown.log")),
+    )
+    turn(ready, rig)
+    (OUT / "graceful").touch()
