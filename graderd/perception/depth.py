@@ -23,11 +23,15 @@ from graderd.perception.registration import SUNK_M, BladeFinder, BladeFix, Groun
 from graderd.perception.settings import DecisionSettings, DepthSettings
 
 I64 = npt.NDArray[np.intp]
+Bools = npt.NDArray[np.bool_]
 
 NOMINAL_WIDTH_PX = 848
 KEPT_GRIDS_N = 64
-THIN_KERNEL = np.ones((5, 5), dtype=np.uint8)
-THIN_TOLERANCE_M = 0.04
+CONTEXT_M = 0.14
+"""The height map goes on so far beyond the reach: what stands at its border is judged by what stands before it."""
+STEEP_TOLERANCE_M = 0.02
+UNSEEN = 10.0
+"""Stands for a height that is not known, metres."""
 FACE_MARGIN_M = 0.025
 """Points closer to the blade's face than this are the face."""
 
@@ -41,7 +45,7 @@ class HeightMap:
     """
 
     height_m: F64
-    seen: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+    seen: Bools
     threshold_m: float
     volumes_l: tuple[float, float, float]
     valid: tuple[float, float, float]
@@ -70,6 +74,7 @@ class DepthJudge:
         self._ahead_n = max(4, round(blade.reach_m / settings.cell_m))
         self._cell_s_m = blade.length_m / self._along_n
         self._cell_d_m = blade.reach_m / self._ahead_n
+        self._context_n = round(CONTEXT_M / self._cell_d_m)
 
     def height_map(self, depth_mm: DepthImage, angle_deg: float) -> HeightMap:
         """Measure one depth picture (uint16, mm along the optical axis, 0 = no value)."""
@@ -81,7 +86,7 @@ class DepthJudge:
         angle = np.radians(angle_deg)
         cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
         d = x * cos + y * sin - np.float32(self._blade.x_offset_m)
-        near = np.flatnonzero((d > -0.20) & (d < self._blade.reach_m + 0.15) & (z < self._settings.max_height_m))
+        near = np.flatnonzero((d > -0.20) & (d < self._blade.reach_m + CONTEXT_M) & (z < self._settings.max_height_m))
         valid = self._valid_shares(pixels[near], angle_deg)
         x, y, z, d = x[near], y[near], z[near], d[near]
         s = y * cos - x * sin
@@ -148,18 +153,21 @@ class DepthJudge:
         blade, settings = self._blade, self._settings
         half = np.float32(blade.length_m / 2)
         front = d > np.maximum(np.float32(FACE_MARGIN_M) - setback, np.float32(0.0))
-        inside = np.flatnonzero(front & (d < blade.reach_m) & (np.abs(s) < half))
+        inside = np.flatnonzero(front & (np.abs(s) < half))
         s, d, z = s[inside], d[inside], z[inside]
+        ahead_n = self._ahead_n + self._context_n
         i = np.minimum(((s + half) * np.float32(1 / self._cell_s_m)).astype(np.int32), self._along_n - 1)
-        j = np.minimum((d * np.float32(1 / self._cell_d_m)).astype(np.int32), self._ahead_n - 1)
-        flat = i * self._ahead_n + j
-        size = self._along_n * self._ahead_n
+        j = np.minimum((d * np.float32(1 / self._cell_d_m)).astype(np.int32), ahead_n - 1)
+        flat = i * ahead_n + j
+        size = self._along_n * ahead_n
         count = np.bincount(flat, minlength=size)
         total = np.bincount(flat, weights=z, minlength=size)
-        seen = (count > 0).reshape(self._along_n, self._ahead_n)
+        seen = (count > 0).reshape(self._along_n, ahead_n)
         height = np.divide(total, count, out=np.zeros(size), where=count > 0).reshape(seen.shape)
-        filled = fill_hidden(height, seen, float(np.tan(np.radians(settings.repose_deg))) * self._cell_d_m)
-        filled = without_thin(filled)
+        slope = np.tan(np.radians((settings.steepest_deg, settings.repose_deg))) * self._cell_d_m
+        seen = without_steep(height, seen, float(slope[0]))
+        filled = fill_hidden(height, seen, float(slope[1]))[:, : self._ahead_n]
+        seen = seen[:, : self._ahead_n]
         distance = 0.9
         expected = settings.disparity_noise_px * distance**2 / (self._focal_px * settings.baseline_m)
         noise = max(expected, ground.residual_m)
@@ -177,23 +185,29 @@ class DepthJudge:
         )
 
 
-def without_thin(height: F64) -> F64:
-    """Heights with what is thin taken away: hoses, rods and single stones stand steep, soil does not.
+def without_steep(height: F64, seen: Bools, rise_per_cell: float) -> Bools:
+    """Which seen cells are ground or soil: hoses, rods and legs rise steeper out of what is seen beside them.
 
-    A morphological opening removes what is narrower than five cells; where it takes away more than a crest at the
-    angle of repose would lose, the opened height is taken.
+    The bound is the lower envelope of cones of slope ``rise_per_cell`` on every seen cell (along the cells' two
+    directions, so that it can be run up with four accumulations).
     """
-    opened = cv2.morphologyEx(height.astype(np.float32), cv2.MORPH_OPEN, THIN_KERNEL, borderType=cv2.BORDER_REPLICATE)
-    return np.where(height > opened + THIN_TOLERANCE_M, opened, height)
+    bound = np.where(seen, height, UNSEEN)
+    for axis in (0, 1):
+        steps = rise_per_cell * np.arange(height.shape[axis])
+        steps = steps[:, None] if axis == 0 else steps[None, :]
+        up = np.minimum.accumulate(bound - steps, axis=axis) + steps
+        down = np.flip(np.minimum.accumulate(np.flip(bound + steps, axis), axis=axis), axis) - steps
+        bound = np.minimum(up, down)
+    return np.asarray(seen & (height <= bound + STEEP_TOLERANCE_M))
 
 
-def fill_hidden(height: F64, seen: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], drop_per_cell: float) -> F64:
-    """Heights with the unseen cells filled along d: from both sides, falling by ``drop_per_cell`` each cell."""
-    ahead, back = height.copy(), height.copy()
-    last = height.shape[1] - 1
-    unseen = ~seen
-    for j in range(last - 1, -1, -1):
-        np.maximum(ahead[:, j + 1] - drop_per_cell, 0.0, out=ahead[:, j], where=unseen[:, j])
-    for j in range(1, last + 1):
-        np.maximum(back[:, j - 1] - drop_per_cell, 0.0, out=back[:, j], where=unseen[:, j])
-    return np.where(seen, height, np.maximum(ahead, back))
+def fill_hidden(height: F64, seen: Bools, drop_per_cell: float) -> F64:
+    """Heights with the unseen cells filled along d: falling by ``drop_per_cell`` each cell from the seen on both sides.
+
+    The steepest fall that soil holds gives the least that can lie there.
+    """
+    fall = drop_per_cell * np.arange(height.shape[1])
+    known = np.where(seen, height, -UNSEEN)
+    ahead = np.maximum.accumulate((known - fall)[:, ::-1], axis=1)[:, ::-1] + fall
+    back = np.maximum.accumulate(known + fall, axis=1) - fall
+    return np.where(seen, height, np.maximum(np.maximum(ahead, back), 0.0))

@@ -22,10 +22,11 @@ GROUND_EXTENT_M = (-2.0, 1.2, -1.2, 1.2)
 """x from, x to, y from, y to (vehicle frame) of what is looked at."""
 CELL_FLAT_M = 0.010
 """Heights within a cell of ground spread less than this; the side of a pile spreads more."""
+MIN_CELL_POINTS_N = 3
 INLIER_M = 0.010
-HYPOTHESES_N = 96
+HYPOTHESES_N = 64
 TOP_BIN_M = 0.005
-SUNK_M = 0.022
+SUNK_M = 0.025
 """The blade lower in the ground than this: what was taken for the ground is a layer of soil."""
 
 
@@ -67,7 +68,7 @@ class GroundFit:
 
     def fit(self, x: F32, y: F32, z: F32) -> Ground:
         """Plane through the ground points among ``x, y, z`` (vehicle frame, m)."""
-        cx, cy, cz, noise = self._flat_cells(x, y, z)
+        cx, cy, cz, noise = self._flat_cells(x[::2], y[::2], z[::2])  # half of the points are plenty
         if cx.size < 6:
             return Ground()
         a = np.column_stack((np.ones_like(cx), cx, cy))
@@ -91,13 +92,13 @@ class GroundFit:
 
     def _flat_cells(self, x: F32, y: F32, z: F32) -> tuple[F64, F64, F64, F64]:
         x0, x1, y0, y1 = GROUND_EXTENT_M
-        take = np.flatnonzero((np.abs(z) < GROUND_BAND_M) & (x > x0) & (x < x1) & (np.abs(y) < y1))
+        take = np.flatnonzero((np.abs(z) < GROUND_BAND_M) & (x > x0) & (np.abs(y) < y1) & (x < x1))
         x, y, z = x[take], y[take], z[take]
         cell = ((x - np.float32(x0)) * np.float32(1 / GROUND_CELL_M)).astype(np.int32) * self._columns
         cell += ((y - np.float32(y0)) * np.float32(1 / GROUND_CELL_M)).astype(np.int32)
         size = self._rows * self._columns
         count = np.bincount(cell, minlength=size)[:size]
-        full = np.flatnonzero(count >= 5)
+        full = np.flatnonzero(count >= MIN_CELL_POINTS_N)
         n = count[full].astype(np.float64)
         sums = [np.bincount(cell, weights=w, minlength=size)[full] / n for w in (x, y, z)]
         spread = np.sqrt(np.maximum(np.bincount(cell, weights=z * z, minlength=size)[full] / n - sums[2] ** 2, 0.0))
@@ -117,8 +118,8 @@ class GroundFit:
         good &= np.hypot(slope_x, slope_y) < 1.5 * self._slope_limit
         good &= np.abs(offset) < 1.5 * self._offset_limit_m
         planes = np.vstack((np.zeros((1, 3)), np.column_stack((offset, slope_x, slope_y))[good]))
-        residual = z[None, :] - planes @ a.T
-        inlier = np.maximum(0.0, 1.0 - (residual / INLIER_M) ** 2).sum(axis=1)
+        residual = (z[None, :] - planes @ a.T).astype(np.float32)
+        inlier = np.maximum(np.float32(0.0), 1 - (residual * np.float32(1 / INLIER_M)) ** 2).sum(axis=1)
         # Nothing lies under the ground: cells below a plane speak against it.
         below = (residual < -2.0 * INLIER_M).sum(axis=1)
         prior = (planes[:, 0] / self._offset_limit_m) ** 2 + (
@@ -199,7 +200,8 @@ class BladeFinder:
             if inside.size >= 8:
                 # The face is the rearmost surface: soil and hoses lie ahead of it.
                 at.append((i + 0.5) / self.COLUMNS_N * blade.length_m - half)
-                medians.append(float(np.percentile(inside, 35)))
+                middle = inside.size * 7 // 20
+                medians.append(float(np.partition(inside, middle)[middle]))
         if len(at) < 4:
             return BladeFix()
         s_at, face_at = np.asarray(at), np.asarray(medians)
@@ -214,7 +216,9 @@ class BladeFinder:
     def _ends(self, s: F32) -> float:
         if s.size < 60:
             return 0.0
-        low, high = np.percentile(s, (0.7, 99.3))
+        rank = s.size * 7 // 1000
+        ranked = np.partition(s, (rank, s.size - 1 - rank))
+        low, high = ranked[rank], ranked[s.size - 1 - rank]
         length = self._blade.length_m
         if abs((high - low) - length) > 0.05:
             return 0.0  # an end is hidden; the middle of what is seen says nothing

@@ -91,13 +91,16 @@ class DepthSettings(Settings):
     )
     min_height_m: Positive = Field(default=0.012, description="and at least this high")
     max_height_m: Positive = Field(default=0.34, description="what stands higher than this is machine, not soil")
+    steepest_deg: Annotated[float, Field(gt=0, lt=89)] = Field(
+        default=60.0, description="what rises steeper is no soil"
+    )
     repose_deg: Annotated[float, Field(gt=0, lt=80)] = Field(
         default=33.0, description="slope given to hidden back faces"
     )
     ground_offset_limit_m: Positive = Field(
-        default=0.06, description="fitted ground further off the calibrated one: knocked"
+        default=0.055, description="fitted ground further off the calibrated one: knocked"
     )
-    ground_slope_limit_deg: Positive = Field(default=4.5, description="fitted ground tilted more than this: knocked")
+    ground_slope_limit_deg: Positive = Field(default=3.4, description="fitted ground tilted more than this: knocked")
     min_valid_percent: Percent = Field(default=35.0, description="less depth than this in front of the blade: unknown")
     none_volume_l: Positive = Field(default=1.2, description="less soil than this in front of the whole blade: none")
 
@@ -119,18 +122,18 @@ class HealthSettings(Settings):
 
     black_percent: Percent = Field(default=6.0, description="brightness below which a picture is black")
     blown_out_percent: Percent = Field(
-        default=45.0, description="share of clipped pixels from which a picture is blown out"
+        default=70.0, description="share of clipped pixels from which a picture is blown out"
     )
     blocked_flat_percent: Percent = Field(default=70.0, description="share of the picture without any texture: blocked")
     frozen_frames_n: int = Field(default=3, ge=0, description="so many identical pictures in a row: frozen; 0: never")
     blurred_ratio: NotNegative = Field(
-        default=0.18, description="fine over coarse contrast below which a picture is blurred"
+        default=0.2, description="fine over coarse contrast below which a picture is blurred"
     )
     torn_s: Positive = Field(default=0.02, description="colour and depth taken further apart than this: torn")
     knocked_mm: Positive = Field(
         default=75.0, description="blade found further than this from where it should be: knocked"
     )
-    knocked_deg: Positive = Field(default=5.0, description="blade found turned by more than this: knocked")
+    knocked_deg: Positive = Field(default=4.0, description="blade found turned by more than this: knocked")
     knocked_missing_percent: Percent = Field(
         default=50.0, description="so much of the blade's face is not there: knocked"
     )
