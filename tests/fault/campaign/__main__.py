@@ -1,0 +1,87 @@
+"""``python -m tests.fault.campaign``: run the campaign, print a table or one JSON line, write JSON and page."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from tests.fault.campaign.conduct import run_case
+from tests.fault.campaign.daemon import BREAKS
+from tests.fault.campaign.model import Case, Outcome, Phase
+from tests.fault.campaign.stack import Stack
+from tests.fault.campaign.table import ACTUATOR, CAMERA, CAN, SERVO
+
+CASES: tuple[Case, ...] = (*CAMERA, *SERVO, *CAN, *ACTUATOR)
+
+
+def chosen(short: bool, faults: list[str], phases: list[str]) -> list[tuple[Case, Phase]]:
+    """The injections to run."""
+    pairs = [(case, phase) for case in CASES for phase in (case.short if short else tuple(Phase))]
+    return [
+        (case, phase)
+        for case, phase in pairs
+        if (not faults or case.name in faults) and (not phases or phase.value in phases)
+    ]
+
+
+async def run(pairs: list[tuple[Case, Phase]], broken: str, quiet: bool) -> list[Outcome]:
+    """Run the injections one after the other on one machine."""
+    outcomes = []
+    with tempfile.TemporaryDirectory(prefix="graderd-faults-") as directory:
+        async with Stack(Path(directory), broken) as stack:
+            for case, phase in pairs:
+                outcome = await run_case(stack, case, phase)
+                outcomes.append(outcome)
+                if not quiet:
+                    sys.stdout.write(_line(outcome) + "\n")
+                    sys.stdout.flush()
+    return outcomes
+
+
+def _line(outcome: Outcome) -> str:
+    def seconds(value: float | None) -> str:
+        return "    —" if value is None else f"{value:5.2f}"
+
+    verdict = "ok " if outcome.passed else "BAD"
+    text = (
+        f"{verdict} {outcome.fault:24} {outcome.phase:16} named {seconds(outcome.detection_s)} s, "
+        f"still {seconds(outcome.standstill_s)} s, {outcome.final_state:9} {outcome.recovery} [{outcome.took_s:.1f} s]"
+    )
+    return "\n      ".join([text, *outcome.problems])
+
+
+def main() -> int:
+    """Command line. Status 0 where every injection passed."""
+    parser = argparse.ArgumentParser(prog="make faults ARGS=", description=__doc__)
+    parser.add_argument("--short", action="store_true", help="the shortened campaign (at least 20 injections)")
+    parser.add_argument("--json", action="store_true", help="print nothing but a last line with all results")
+    parser.add_argument("--fault", action="append", default=[], metavar="NAME", help="only this one (repeatable)")
+    parser.add_argument("--phase", action="append", default=[], choices=[p.value for p in Phase])
+    parser.add_argument("--list", action="store_true", help="list the faults")
+    parser.add_argument("--output", type=Path, help="write the results as JSON")
+    parser.add_argument("--break", dest="broken", default="", choices=["", *BREAKS], help="spoil one reaction")
+    options = parser.parse_args()
+    if options.list:
+        sys.stdout.writelines(f"{case.name:24} {case.text}\n" for case in CASES)
+        return 0
+    pairs = chosen(options.short, options.fault, options.phase)
+    began_s = time.monotonic()
+    outcomes = asyncio.run(run(pairs, options.broken, options.json))
+    results = {"results": [outcome.as_json() for outcome in outcomes]}
+    if options.output is not None:
+        options.output.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    good_n = sum(outcome.passed for outcome in outcomes)
+    if options.json:
+        sys.stdout.write(json.dumps(results) + "\n")
+    else:
+        sys.stdout.write(f"{good_n} of {len(outcomes)} injections passed in {time.monotonic() - began_s:.0f} s\n")
+    return 0 if good_n == len(outcomes) and outcomes else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

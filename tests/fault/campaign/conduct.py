@@ -1,0 +1,290 @@
+"""How one injection is run: into the phase, the fault, what the daemon and the devices make of it, and back."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import suppress
+
+from graderd.core.fault_catalogue import CATALOGUE
+from graderd.core.faults import ALL_AXES, Clear, FaultRow, Reaction, catalogue_key
+from tests.fault.campaign.model import Case, Outcome, Phase
+from tests.fault.campaign.stack import CampaignError, JsonObject, Stack
+from tests.fault.campaign.watch import MOVING, axes_of
+
+BRAKE_S = 0.7
+"""Promised from detection (or from a ``manual`` command) to standstill: a tick, the wire, the way to stop."""
+SLACK_S = 0.4
+"""For a loaded machine, on top of every promise: campaign, rig, daemon and pictures share what cores there are."""
+STILL_S = 0.3
+EVERYTHING = tuple(MOVING)
+OUTSIDE_DEG = 0.5
+
+
+def row_of(fault: str) -> FaultRow:
+    """The catalogue's row for a fault's name."""
+    device, _, condition = fault.partition(".")
+    return CATALOGUE[catalogue_key(device, condition)]
+
+
+def held_by(fault: str) -> frozenset[str]:
+    """Axes that the catalogue holds for this fault."""
+    row, device = row_of(fault), fault.partition(".")[0]
+    if row.reaction < Reaction.HOLD:
+        return frozenset()
+    if row.axes == frozenset({"own"}):
+        return frozenset({"tilt" if device == "tilt" else "lift"})
+    return row.axes
+
+
+def expected_mode(reaction: Reaction, before: str) -> str:
+    """The mode a reaction leads to."""
+    if reaction is Reaction.STOP:
+        return "stopped"
+    if reaction is Reaction.DISARM:
+        return "disarmed"
+    return "manual" if reaction is Reaction.RETREAT else before
+
+
+def must_stand(fault: str, before: str) -> tuple[str, ...]:
+    """Axes that must come to rest by themselves."""
+    row = row_of(fault)
+    if row.reaction >= Reaction.DISARM or (row.reaction is Reaction.RETREAT and before == "auto"):
+        return EVERYTHING
+    return axes_of(held_by(fault))
+
+
+async def make_ready(stack: Stack) -> None:
+    """Armed, manual, standing, without any fault: where every injection begins and where a recovery must lead."""
+    await stack.rest()
+    end_s = time.monotonic() + 25.0
+    while time.monotonic() < end_s:
+        status = await stack.read_status()
+        if status is None:
+            await asyncio.sleep(0.1)
+            continue
+        faults = [
+            f["name"] for f in status["faults"] if f["name"] not in ("daemon.lease_lapsed", "daemon.tick_overrun")
+        ]
+        if status["mode"] == "stopped":
+            await stack.command("reset")
+        elif status["mode"] == "disarmed":
+            if not status["arming"] and all(r["met"] for r in status["readiness"] if r["mandatory"]):
+                await stack.command("arm")
+        elif status["mode"] == "auto":
+            await stack.command("manual")
+        elif any(not f["present"] for f in status["faults"] if f["clears"] != Clear.WHEN_GONE):
+            await stack.command("disarm")
+        elif not faults and not stack.watch.moving(EVERYTHING) and status["soil"]["frames_per_s"] > 0:
+            return
+        await asyncio.sleep(0.05)
+    told = {key: stack.status.get(key) for key in ("mode", "reason", "holding")}
+    raise CampaignError(
+        f"not ready again: {told}, {[(f['name'], f['detail']) for f in stack.status.get('faults', [])]}"
+    )
+
+
+async def enter(stack: Stack, phase: Phase) -> None:
+    """Bring the ready machine into the phase.
+
+    Raises:
+        CampaignError: it does not get there.
+    """
+    watch = stack.watch
+    if phase is Phase.TURNING:
+        angle_deg = watch.newest().state["blade_deg"]
+        await stack.ask_rig("scene", zone="right" if angle_deg > 8.0 else "even", seed=3)
+        if not (await stack.command("auto"))["accepted"]:
+            raise CampaignError("automatic operation was refused")
+        await stack.until(
+            lambda: abs(watch.newest().state["blade_deg"] - angle_deg) > 4.0 and watch.moving(("rotation",)),
+            10.0,
+            f"no turn from {angle_deg:.0f}° ({stack.status['soil']['zone']})",
+        )
+    elif phase is Phase.LIFTING:
+        low = watch.newest().state["lift_left_mm"] < 160.0
+        await stack.move("preset", name="high" if low else "low")
+        await stack.until(
+            lambda: all(watch.moving((axis,)) for axis in ("lift_left", "lift_right", "rotation")),
+            5.0,
+            "the preset does not move the axes",
+        )
+        await asyncio.sleep(0.15)
+
+
+async def demand(stack: Stack, needs: str) -> None:
+    """Move an axis by hand, so that a fault which only shows in motion can show."""
+    await stack.command("manual")
+    state = stack.watch.newest().state
+    if needs == "rotation":
+        await stack.move("jog", axis="rotate", value=-25.0 if state["blade_deg"] > 0 else 25.0)
+    else:
+        await stack.move("jog", axis="lift", value=60.0 if state["lift_left_mm"] < 160 else -60.0, relative=True)
+
+
+async def run_case(stack: Stack, case: Case, phase: Phase) -> Outcome:
+    """One injection from a ready machine to a ready machine."""
+    outcome = Outcome(case.name, str(phase))
+    began_s = time.monotonic()
+    stack.new_log_errors()
+    try:
+        await make_ready(stack)
+        await enter(stack, phase)
+        await (case.conduct or general)(stack, case, phase, outcome)
+    except CampaignError as error:
+        outcome.problems.append(str(error))
+    finally:
+        await stack.rest()
+        with suppress(CampaignError):
+            await case.repair(stack)
+            await stack.heal()
+    unexpected = [e for e in stack.new_log_errors() if not any(part in e for part in case.log_errors)]
+    if unexpected:
+        outcome.problems.append(f"{len(unexpected)} unexpected log errors, the first: {unexpected[0][:300]}")
+    outcome.took_s = time.monotonic() - began_s
+    return outcome
+
+
+async def general(stack: Stack, case: Case, phase: Phase, outcome: Outcome) -> None:
+    """Inject, see it named, see it stop what the catalogue says, take the cause away, see it recover."""
+    fault = case.faults[0]
+    before = "auto" if phase is Phase.TURNING else "manual"
+    shows = not case.needs or phase is Phase.LIFTING or (phase is Phase.TURNING and case.needs == "rotation")
+    from_s = time.monotonic()
+    await case.inject(stack)
+    if not shows:
+        before = "manual"
+        await asyncio.sleep(STILL_S)
+        from_s = time.monotonic()
+        await demand(stack, case.needs)
+    await detect(stack, case, outcome, from_s)
+    await react(stack, case, outcome, from_s, before)
+    await recover(stack, case, outcome, before)
+    if fault not in outcome.seen and outcome.detected:
+        outcome.problems.append(f"named {', '.join(outcome.seen)} instead of {fault}")
+
+
+async def detect(stack: Stack, case: Case, outcome: Outcome, from_s: float) -> None:
+    """Wait until the daemon names the fault."""
+    end_s = time.monotonic() + case.detect_s + SLACK_S + 1.0
+    while time.monotonic() < end_s:
+        status = await stack.read_status()
+        named = [] if status is None else [f for f in status["faults"] if f["name"] in case.faults]
+        if status is not None and named and status["time_s"] >= from_s:
+            outcome.detected = True
+            outcome.detection_s = max(0.0, status["time_s"] - from_s)
+            outcome.message = f"{named[0]['reads']} ({named[0]['detail']})"
+            if outcome.detection_s > case.detect_s + SLACK_S:
+                outcome.problems.append(f"detected after {outcome.detection_s:.2f} s, {case.detect_s:g} s promised")
+            return
+        await asyncio.sleep(0.015)
+    names = [f["name"] for f in stack.status.get("faults", [])]
+    outcome.problems.append(f"not detected; active: {names or 'nothing'}")
+
+
+async def react(stack: Stack, case: Case, outcome: Outcome, from_s: float, before: str) -> None:
+    """Mode, standstill and limits, against the catalogue."""
+    fault, watch = case.faults[0], stack.watch
+    outcome.expected_state = expected_mode(row_of(fault).reaction, before)
+    with suppress(CampaignError):
+        await stack.until_status(lambda s: s["mode"] == outcome.expected_state, 1.0, "the mode does not change")
+    stopping = tuple(a for a in must_stand(fault, before) if a not in axes_of(case.own_motion))
+    still = await watch.until_still(stopping, STILL_S, 3.0) if stopping else True
+    # Some more time under the fault: what began to move again would be seen, and later faults would be named.
+    await asyncio.sleep(0.2)
+    status = await stack.read_status() or {}
+    names_seen = {f["name"] for f in status.get("faults", [])}
+    outcome.seen = tuple(sorted(names_seen | ({fault} if outcome.detected and fault in outcome.message else set())))
+    outcome.final_state = str(status.get("mode", "no answer"))
+    if stopping:
+        outcome.standstill_s = watch.standstill_s(stopping, from_s)
+    others = tuple(a for a in EVERYTHING if a not in stopping and a not in axes_of(case.own_motion))
+    released_s = time.monotonic()
+    if others and outcome.final_state in ("manual", "auto"):
+        await stack.rest()
+        await stack.command("manual")
+        still = await watch.until_still(others, STILL_S, 3.0) and still
+        if watch.standstill_s(others, released_s) > BRAKE_S + SLACK_S:
+            outcome.problems.append("did not come to rest after 'manual' under the fault")
+    if not stopping:
+        outcome.standstill_s, outcome.standstill_from = watch.standstill_s(others, released_s), "manual command"
+    outcome.safe = _judge(stack, case, outcome, from_s) and still
+
+
+def _judge(stack: Stack, case: Case, outcome: Outcome, from_s: float) -> bool:
+    """Whether the machine did what was promised; what it did not is added to the problems."""
+    promised_s = BRAKE_S + (case.detect_s if outcome.standstill_from == "injection" else 0.0)
+    wrong = []
+    if outcome.standstill_s is None or outcome.standstill_s > promised_s + SLACK_S:
+        wrong.append(f"standstill after {outcome.standstill_s} s, {promised_s:.1f} s promised")
+    if outcome.final_state != outcome.expected_state:
+        wrong.append(f"ended {outcome.final_state}, the catalogue says {outcome.expected_state}")
+    if "rotation" not in case.own_motion:
+        most_deg = max(abs(s.state["blade_deg"]) for s in stack.watch.since(from_s))
+        if most_deg > 60.0 + OUTSIDE_DEG:
+            wrong.append(f"the blade came to {most_deg:.1f}°")
+    outcome.problems += wrong
+    return not wrong
+
+
+async def recover(stack: Stack, case: Case, outcome: Outcome, before: str) -> None:
+    """Take the cause away; see the fault go, or stay, and the machine come back, as the catalogue says."""
+    row = row_of(case.faults[0])
+    await stack.rest()
+    await case.repair(stack)
+    way = []
+    mode = outcome.final_state
+    try:
+        if row.clear is Clear.WHEN_GONE:
+            await stack.until_status(
+                lambda s: not _named(s, case.faults), case.recover_s, f"{case.faults[0]} does not go away"
+            )
+        else:
+            await asyncio.sleep(0.4)
+            if outcome.detected and not _named(await stack.read_status() or {}, case.faults):
+                raise CampaignError(f"{case.faults[0]} went away by itself; the catalogue says: {row.clear}")
+        if mode == "stopped":
+            if (await stack.command("arm"))["accepted"]:
+                raise CampaignError("armed without a reset after a stop")
+            await asyncio.sleep(0.2)
+            await _retry(stack, "reset", case.recover_s)
+            way.append("reset")
+        elif mode != "disarmed" and row.clear is not Clear.WHEN_GONE:
+            await stack.command("disarm")
+            way.append("disarm")
+        if case.before_arm is not None:
+            await case.before_arm(stack)
+            way.append("reboot the servo")
+        if mode in ("stopped", "disarmed") or way:
+            await _retry(stack, "arm", case.recover_s)
+            await stack.until_status(lambda s: s["mode"] == "manual", 6.0, "not armed again")
+            way.append("arm")
+        if before == "auto" and row.reaction is Reaction.RETREAT:
+            await _retry(stack, "auto", 2.0)
+            way.append("auto")
+        await stack.until_status(
+            lambda s: not _named(s, case.faults), 3.0, f"{case.faults[0]} is still there after {way}"
+        )
+        outcome.recovered_as_catalogued = stack.daemon.returncode is None
+        outcome.recovery = ", ".join(way) or "by itself"
+    except CampaignError as error:
+        outcome.problems.append(str(error))
+
+
+async def _retry(stack: Stack, command: str, timeout_s: float) -> None:
+    """Devices come back and are found again in their own time: ask until it is accepted."""
+    end_s = time.monotonic() + timeout_s
+    answer: JsonObject = {}
+    while time.monotonic() < end_s:
+        answer = await stack.command(command)
+        if answer["accepted"]:
+            return
+        await asyncio.sleep(0.1)
+    raise CampaignError(f"{command} stays refused: {answer.get('message') or answer.get('error')}")
+
+
+def _named(status: JsonObject, faults: tuple[str, ...]) -> list[str]:
+    return [f["name"] for f in status.get("faults", []) if f["name"] in faults]
+
+
+__all__ = ["ALL_AXES", "BRAKE_S", "SLACK_S", "enter", "expected_mode", "general", "make_ready", "run_case"]

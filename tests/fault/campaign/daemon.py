@@ -1,0 +1,102 @@
+"""The daemon with handles for what cannot be done to a process from outside: ``python -m tests.fault.campaign.daemon``.
+
+Nothing of the product knows of this. On SIGUSR1 the process does what ``hook.json`` in its rig's directory says:
+``block_s`` stops the event loop, ``clock_step_s`` shows the daemon a stepped wall clock, ``memory_mb`` takes memory.
+``GRADERD_CAMPAIGN_BREAK`` spoils one safety reaction, to prove that the campaign notices (see ``BREAKS``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from graderd.core import machine
+from graderd.core.fault_catalogue import CATALOGUE
+from graderd.core.faults import Reaction
+from graderd.runtime import control
+from graderd.runtime.app import daemon as product
+from graderd.runtime.devices import Devices
+from graderd.runtime.perception import PerceptionWorker
+
+WORKER = "tests.fault.campaign.worker"
+
+
+def _only_warn(key: str) -> None:
+    rows = dict(CATALOGUE)
+    rows[key] = dataclasses.replace(rows[key], reaction=Reaction.WARN)
+    control.CATALOGUE = rows
+
+
+def _hold_nothing() -> None:
+    machine.held_axes = lambda _: frozenset()
+
+
+def _silent_stop() -> None:
+    Devices.hold_all = lambda _: ()  # type: ignore[method-assign]  # this defect is the purpose
+    machine._unheld = lambda goals, _: goals
+    control.ControlLoop._hold = lambda _, __: None  # type: ignore[method-assign]  # this defect is the purpose
+
+
+def _forget_latches() -> None:
+    rows = {key: dataclasses.replace(row, clear=control.Clear.WHEN_GONE) for key, row in CATALOGUE.items()}
+    control.CATALOGUE = rows
+
+
+BREAKS: dict[str, Callable[[], None]] = {
+    "camera_missing_only_warns": partial(_only_warn, "camera.missing"),
+    "held_axes_go_on": _hold_nothing,
+    "latches_let_go": _forget_latches,
+}
+"""Defects of one reaction each; every one must turn the campaign red."""
+
+
+class Hooks:
+    """Does to this process what its signal asks for."""
+
+    def __init__(self, directory: Path) -> None:
+        self._file = directory / "hook.json"
+        self._kept: list[bytearray] = []
+        self._time = time.time
+        self._step_s = 0.0
+
+    def on_signal(self, _: int, __: FrameType | None) -> None:
+        """Runs in the main thread, between two instructions of the event loop."""
+        wanted: dict[str, Any] = json.loads(self._file.read_text(encoding="utf-8"))
+        if "block_s" in wanted:
+            time.sleep(wanted["block_s"])
+        if "clock_step_s" in wanted:
+            self._step_s += wanted["clock_step_s"]
+            step_s = self._step_s
+            time.time = lambda: self._time() + step_s
+        if "memory_mb" in wanted:
+            self._kept = [bytearray(os.urandom(1 << 20)) for _ in range(int(wanted["memory_mb"]))]
+
+
+def main() -> int:
+    """``graderd run`` with the handles."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--rig-dir", type=Path, required=True)
+    options = parser.parse_args()
+    broken = os.environ.get("GRADERD_CAMPAIGN_BREAK", "")
+    if broken:
+        BREAKS[broken]()
+    signal.signal(signal.SIGUSR1, Hooks(options.rig_dir).on_signal)
+    os.environ["GRADERD_CAMPAIGN_LIE"] = str(options.rig_dir / "lie.json")
+    command = (sys.executable, "-m", WORKER)
+    product.PerceptionWorker = partial(PerceptionWorker, command=command)  # type: ignore[assignment, misc]  # same call
+    return product.run_daemon(options.config, False, options.rig_dir, True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

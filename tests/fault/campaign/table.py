@@ -1,0 +1,175 @@
+"""The table of faults that the rig can make: camera, servo, CAN bus and actuators. The daemon's own: ``table_daemon``."""
+
+from __future__ import annotations
+
+import os
+import signal
+from contextlib import suppress
+from typing import Any
+
+from tests.fault.campaign.model import ROTATION, Action, Case, Phase
+from tests.fault.campaign.stack import Stack
+
+IDLE, TURNING, LIFTING = Phase.IDLE, Phase.TURNING, Phase.LIFTING
+
+
+def camera(name: str, **params: float) -> Action:
+    """A fault of the rig's camera."""
+
+    async def inject(stack: Stack) -> None:
+        await stack.ask_rig("camera_fault", name=name, params=params)
+
+    return inject
+
+
+def servo(name: str, **params: float) -> Action:
+    """A fault of the virtual servo or its wire."""
+
+    async def inject(stack: Stack) -> None:
+        await stack.ask_rig("servo_fault", name=name, params=params)
+
+    return inject
+
+
+def actuator(name: str, device: str | None = None, **params: float) -> Action:
+    """A fault of one virtual actuator, or of the bus."""
+
+    async def inject(stack: Stack) -> None:
+        await stack.ask_rig("actuator_fault", name=name, device=device, params=params)
+
+    return inject
+
+
+def worker(number: signal.Signals) -> Action:
+    """A signal to the perception child."""
+
+    async def inject(stack: Stack) -> None:
+        os.kill(stack.worker_pid(), number)
+
+    return inject
+
+
+async def heal(stack: Stack) -> None:
+    """The cause goes away."""
+    await stack.heal()
+
+
+async def thaw(stack: Stack) -> None:
+    """A stopped child is killed by the daemon; should it live still, let it go on."""
+    with suppress(Exception):
+        os.kill(stack.worker_pid(), signal.SIGCONT)
+
+
+async def reboot(stack: Stack) -> None:
+    """What the remedy of a hardware alert asks for."""
+    await stack.service("rotation.reboot", consent=True)
+
+
+def _camera(name: str, text: str, fault: str, inject: Action, **more: Any) -> Case:
+    return Case(f"camera_{name}", text, (f"camera.{fault}",), inject, heal, **more)
+
+
+def _servo(name: str, text: str, faults: str, inject: Action, **more: Any) -> Case:
+    named = tuple(f"rotation.{fault}" for fault in faults.split())
+    return Case(f"servo_{name}", text, named, inject, heal, **more)
+
+
+def _actuator(name: str, text: str, faults: str, inject: Action, **more: Any) -> Case:
+    return Case(f"actuator_{name}", text, tuple(faults.split()), inject, heal, **more)
+
+
+def _can(name: str, text: str, fault: str, inject: Action, **more: Any) -> Case:
+    return Case(f"can_{name}", text, (f"can.{fault}",), inject, heal, **more)
+
+
+CAMERA = (
+    _camera("unplug", "the camera is gone", "missing", camera("unplug"), detect_s=1.0, short=(TURNING,)),
+    _camera("stall", "no further frame, the connection stays", "stale", camera("stall"), detect_s=0.8),
+    _camera("freeze", "the same picture under new numbers", "frozen", camera("freeze"), detect_s=1.5),
+    _camera("black", "no light", "black", camera("black"), detect_s=0.8, short=(TURNING, LIFTING)),
+    _camera("blown_out", "overexposed", "blown_out", camera("blown_out"), detect_s=0.8),
+    _camera("blocked", "something covers both lenses", "blocked", camera("blocked"), detect_s=0.8),
+    _camera("blurred", "out of focus", "blurred", camera("blurred"), detect_s=1.3),
+    _camera("torn", "depth from an earlier frame than colour", "torn", camera("torn"), detect_s=1.2),
+    _camera("knocked", "the mount was hit", "knocked", camera("knocked"), detect_s=3.0),
+    _camera("half_size", "pictures at half the size", "wrong_resolution", camera("wrong_resolution"), detect_s=0.8),
+    _camera("no_depth", "the depth stream stops", "depth_missing", camera("no_depth"), detect_s=1.3),
+    _camera("worker_killed", "the perception child is killed", "worker_restarted", worker(signal.SIGKILL)),
+    Case(
+        "camera_worker_hung",
+        "the perception child stands still (SIGSTOP)",
+        ("camera.stale", "camera.worker_hung"),
+        worker(signal.SIGSTOP),
+        thaw,
+        detect_s=0.8,
+    ),
+)
+
+SERVO = (
+    _servo("silence", "no status packet arrives", "no_reply", servo("drop"), short=(TURNING,)),
+    _servo("deaf", "no instruction packet arrives", "no_reply", servo("drop_requests")),
+    _servo("crc", "a bit of every reply is flipped", "corrupt_replies no_reply", servo("flip")),
+    _servo("crc_some", "a bit of every fourth reply is flipped", "corrupt_replies", servo("flip", rate=0.25), detect_s=1.0),
+    _servo("truncated", "half of the replies lack their end", "corrupt_replies no_reply", servo("truncate", rate=0.5)),
+    _servo("foreign", "replies carry another id", "no_reply", servo("foreign_id")),
+    _servo("late", "replies come 0.4 s late", "no_reply", servo("delay", seconds=0.4)),
+    _servo("unplug", "the adapter's plug is pulled and put back", "unplugged", servo("unplug"), short=(LIFTING,)),
+    _servo("power_cut", "24 V fail, and return with the repair", "no_reply", servo("power_cut")),
+    _servo("brown_out", "a supply dip resets the RAM", "ram_reset torque_off", servo("ram_reset"), short=(TURNING,)),
+    _servo("torque_off", "torque switched off by somebody else", "torque_off", servo("torque_off"), short=(LIFTING,)),
+    _servo("turns_lost", "the turn count jumps", "turns_lost", servo("turns_lost")),
+    _servo("jam", "the shaft is blocked", "not_moving", servo("jam"), needs="rotation", detect_s=1.2, short=(TURNING,)),
+    _servo(
+        "wrong_way", "the motor runs the wrong way", "wrong_way", servo("wrong_way"),
+        needs="rotation", detect_s=1.2, own_motion=ROTATION,
+    ),
+    _servo(
+        "runaway", "an outer torque turns the blade", "moving_uncommanded", servo("push", torque_nm=120.0),
+        detect_s=2.5, own_motion=ROTATION,
+    ),
+    _servo("weak_supply", "19.5 V at the servo", "voltage_near_limit", servo("voltage", volts=19.5), detect_s=1.0),
+    _servo("hot", "75 °C", "temperature_near_limit", servo("temperature", celsius=75.0), detect_s=1.6),
+    *(
+        _servo(
+            f"alert_{name}", f"hardware alert {name}", f"alert_{name}", servo(f"alert_{name}"),
+            before_arm=reboot, short=short,
+        )
+        for name, short in (
+            ("voltage", ()), ("hall_sensor", ()), ("overheating", ()), ("encoder", ()), ("electrical_shock", ()),
+            ("overload", (TURNING,)),
+        )
+    ),
+)  # fmt: skip
+
+CAN = (
+    _can("unplug", "the adapter is pulled and put back", "unplugged", actuator("unplug"), short=(LIFTING,)),
+    _can("bus_off", "the controller leaves the bus", "bus_off", actuator("bus_off"), short=(LIFTING,)),
+    _can("error_passive", "128 errors counted", "error_passive", actuator("error_passive")),
+    _can("overrun", "received frames were lost", "queue_overrun", actuator("overrun")),
+    _can("flood", "2000 foreign frames a second", "flood", actuator("flood"), detect_s=1.6, short=(TURNING,)),
+    _can("equal_address", "a node with our address and NAME", "address_conflict", actuator("address_conflict")),
+    _can("claim_storm", "a node claims our address without end", "claim_storm", actuator("claim_storm"), detect_s=1.0),
+)
+
+ACTUATOR = (
+    _actuator("silence", "the left lift is not heard", "lift_left.no_feedback", actuator("silence", "lift_left"), short=(IDLE, LIFTING)),
+    _actuator("all_silent", "no actuator is heard", "lift_left.no_feedback", actuator("silence")),
+    _actuator("power_cut", "the right lift loses power", "lift_right.no_feedback", actuator("power_cut", "lift_right")),
+    _actuator("restart", "the tilt restarts", "tilt.restarted", actuator("restart", "tilt"), detect_s=1.5),
+    _actuator("garbage", "the left lift sends garbage", "lift_left.implausible_feedback lift_left.no_feedback", actuator("garbage", "lift_left"), detect_s=1.0),
+    _actuator("lying", "the left lift repeats its last position", "lift_left.not_moving", actuator("frozen_feedback", "lift_left"), needs="lift", detect_s=1.6),
+    _actuator("babble", "the tilt sends 500 messages a second", "tilt.feedback_flood", actuator("babble", "tilt"), detect_s=1.0),
+    _actuator("wrong_address", "the right lift answers at another address", "lift_right.wrong_address", actuator("wrong_address", "lift_right"), detect_s=0.8),
+    _actuator("stuck", "the left lift is stuck", "lift_left.overload lift_left.not_moving", actuator("stuck", "lift_left"), needs="lift", detect_s=1.6, short=(LIFTING,)),
+    _actuator("drift", "the load moves the right lift", "lift_right.uncommanded_motion lift_right.backdrive", actuator("drift", "lift_right"), detect_s=2.5, own_motion=frozenset({"lift_right"})),
+    _actuator("override", "the tilt's manual override is used", "tilt.uncommanded_motion", actuator("manual_override", "tilt"), detect_s=2.0, own_motion=frozenset({"tilt"})),
+    _actuator("overload", "4000 N on the left lift", "lift_left.overload", actuator("overload", "lift_left"), needs="lift", detect_s=1.5),
+    _actuator("fatal", "the tilt reports a fatal error", "tilt.fatal", actuator("fatal", "tilt"), short=(TURNING,)),
+    _actuator("low_voltage", "8 V at the left lift", "lift_left.voltage", actuator("voltage_low", "lift_left"), detect_s=1.0),
+    _actuator("high_voltage", "17 V at all actuators", "tilt.voltage", actuator("voltage_high"), detect_s=1.0),
+    _actuator("cold", "-45 °C at the right lift", "lift_right.temperature", actuator("temperature_low", "lift_right"), detect_s=1.0),
+    _actuator("hot", "90 °C at the tilt", "tilt.temperature", actuator("temperature_high", "tilt"), detect_s=1.0),
+    _actuator("backdrive", "the left lift reports backdrive", "lift_left.backdrive", actuator("backdrive", "lift_left")),
+    _actuator("parameter", "the tilt refuses our messages", "tilt.parameter", actuator("parameter", "tilt")),
+    _actuator("saturation", "the right lift is near its most", "lift_right.saturation", actuator("saturation", "lift_right"), detect_s=1.6),
+)  # fmt: skip
