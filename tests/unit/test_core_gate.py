@@ -91,7 +91,7 @@ def test_absolute_limits_swept_densely(axis: str, side: str) -> None:
     start = replace(POSE, **{FIELDS[axis]: bound - 1.0 if side == "high" else bound + 1.0})
     for step in range(-40, 41):
         wanted = bound + step * 0.01
-        end = drive(goal(axis, wanted), inputs(pose=start), 200)[-1][axis]
+        end = drive(goal(axis, wanted), inputs(pose=start), 80)[-1][axis]
         assert end is not None
         assert limits.low <= end <= limits.high
         assert end == pytest.approx(min(max(wanted, limits.low), limits.high), abs=1e-9)
