@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Awaitable, Callable
 from importlib.metadata import PackageNotFoundError, version
 
@@ -11,7 +10,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from graderd.api.http_routes import http_routes
+from graderd.api.closing import Closing
+from graderd.api.http_routes import StatusTexts, http_routes
 from graderd.api.limiter import Limiter
 from graderd.api.port import DaemonPort
 from graderd.api.problem import Problem, ProblemError, problem_of_validation
@@ -33,7 +33,7 @@ Two paths are WebSockets: `/v1/stream` and `/v1/jog`. Messages are JSON texts.
 
 
 def make_app(port: DaemonPort, limits: ApiLimits | None = None) -> FastAPI:
-    """The application. ``app.state.closing`` is an event: set, it ends open streams."""
+    """The application. ``app.state.closing`` is its :class:`Closing`; whoever serves it tells it when to end."""
     limits = limits or ApiLimits()
     app = FastAPI(
         title="graderd",
@@ -42,13 +42,15 @@ def make_app(port: DaemonPort, limits: ApiLimits | None = None) -> FastAPI:
         openapi_url="/v1/openapi.json",
         docs_url=None,
         redoc_url=None,
+        redirect_slashes=False,
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
         servers=[{"url": "http://localhost", "description": "over the unix socket"}],
     )
-    app.state.closing = asyncio.Event()
-    app.include_router(http_routes(port, limits))
-    app.include_router(socket_routes(port, limits, app.state.closing))
-    app.add_middleware(Limiter, limits=limits)
+    app.state.closing = Closing()
+    texts = StatusTexts()
+    app.include_router(http_routes(port, limits, texts))
+    app.include_router(socket_routes(port, limits, texts, app.state.closing))
+    app.add_middleware(Limiter, limits=limits, closing=app.state.closing)
     for kind, handler in _handlers().items():
         app.add_exception_handler(kind, handler)
     return app

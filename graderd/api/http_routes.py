@@ -44,13 +44,26 @@ class StopRequest(BaseModel):
     reason: str = Field("stop request", max_length=200, description="kept as the reason of the stop")
 
 
-def http_routes(port: DaemonPort, limits: ApiLimits) -> APIRouter:
+class StatusTexts:
+    """The newest status as JSON, made once however many clients look on."""
+
+    def __init__(self) -> None:
+        self._status: Status | None = None
+        self._text = ""
+
+    def text(self, status: Status) -> str:
+        if status is not self._status:
+            self._status, self._text = status, status.model_dump_json()
+        return self._text
+
+
+def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts) -> APIRouter:
     """The routes over ``port``."""
     router = APIRouter(prefix="/v1")
 
-    @router.get("/status", tags=["status"], summary="Everything at the last control tick")
-    async def status() -> Status:
-        return port.status()
+    @router.get("/status", tags=["status"], summary="Everything at the last control tick", response_model=Status)
+    async def status() -> Response:
+        return Response(texts.text(port.status()), media_type="application/json")
 
     @router.post("/commands", tags=["commands"], summary="Send one command", responses=PROBLEMS)
     async def command(command: Annotated[AnyCommand, Body(openapi_examples=COMMAND_EXAMPLES)]) -> Reply:

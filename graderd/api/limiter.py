@@ -13,6 +13,7 @@ from collections.abc import Awaitable, Callable
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from graderd.api.closing import Closing
 from graderd.api.problem import Problem, answer
 from graderd.api.settings import ApiLimits
 
@@ -39,9 +40,10 @@ class Pace:
 class Limiter:
     """ASGI middleware; see the module's text."""
 
-    def __init__(self, app: ASGIApp, limits: ApiLimits) -> None:
+    def __init__(self, app: ASGIApp, limits: ApiLimits, closing: Closing) -> None:
         self._app = app
         self._limits = limits
+        self._closing = closing
         self._pace = Pace(limits.rate_hz, limits.burst_n)
         self._stop_pace = Pace(limits.stop_rate_hz, max(1, round(limits.stop_rate_hz / 10)))
         self._slots = asyncio.Semaphore(limits.active_n)
@@ -54,7 +56,7 @@ class Limiter:
         if scope["type"] == "websocket":
             await self._websocket(scope, receive, send)
         elif scope["type"] == "http":
-            await self._http(scope, receive, send)
+            await self._unless_closing(scope, receive, send)
         else:
             await self._app(scope, receive, send)
 
@@ -72,6 +74,26 @@ class Limiter:
             await self._app(scope, receive, send)
         finally:
             self._websockets_n -= 1
+
+    async def _unless_closing(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a request; one that still waits for something when the daemon ends is answered so."""
+        answered = False
+
+        async def noted(message: Message) -> None:
+            nonlocal answered
+            answered = True
+            await send(message)
+
+        try:
+            with self._closing.interrupts():
+                if not self._closing.begun:
+                    await self._http(scope, receive, noted)
+        except asyncio.CancelledError:
+            if not self._closing.begun:
+                raise
+        if self._closing.begun and not answered:
+            problem = Problem(error="the daemon ends", where=str(scope["path"]))
+            await answer(503, problem, scope, receive, send, {"Connection": "close"})
 
     async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
         path = scope["path"]

@@ -6,13 +6,14 @@ import asyncio
 import contextlib
 import fcntl
 import grp
+import logging
 import os
 import socket
 import stat
 from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import uvicorn
 from fastapi import FastAPI
@@ -21,10 +22,12 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from graderd.api.guard import TcpGuard, load_or_make_token
+from graderd.api.limiter import Pace
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.hal.errors import DeviceError
 
-ACCEPT_BATCH_N = 16
+ACCEPT_BURST_N = 20
+ACCEPT_RETRY_S = 0.1
 LISTEN_QUEUE_N = 128
 STREAM_BUFFER_BYTES = 16_384
 MAX_PATH_BYTES = 107
@@ -59,14 +62,13 @@ async def serve(
     """
     limits = limits or ApiLimits()
     with contextlib.ExitStack() as stack:
-        servers = [
-            _Server(_config(app, limits), stack.enter_context(unix_socket(socket_path, socket_mode, socket_group)))
-        ]
+        listener = stack.enter_context(unix_socket(socket_path, socket_mode, socket_group))
+        servers = [_Server(_config(app, limits), listener, limits)]
         if tcp is not None:
             listener = stack.enter_context(_tcp_socket(tcp))
             port_n = listener.getsockname()[1]
             guarded = TcpGuard(app, load_or_make_token(tcp.token_file), port_n, tcp.allowed_hosts)
-            servers.append(_Server(_config(guarded, limits), listener))
+            servers.append(_Server(_config(guarded, limits), listener, limits))
         tasks = [asyncio.create_task(server.run_until_told(), name=f"api server {server.name}") for server in servers]
         try:
             for server in servers:
@@ -77,7 +79,7 @@ async def serve(
             for task in ended:
                 task.result()
         finally:
-            app.state.closing.set()
+            app.state.closing.begin()
             for server in servers:
                 server.should_exit = True
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -191,17 +193,18 @@ def _config(app: ASGIApp, limits: ApiLimits) -> uvicorn.Config:
         server_header=False,
         date_header=False,
         proxy_headers=False,
-        backlog=ACCEPT_BATCH_N,
         timeout_graceful_shutdown=1,
     )
 
 
 class _Server(uvicorn.Server):
-    """uvicorn on one socket of ours, told to end by ``should_exit`` alone: signals belong to the daemon."""
+    """uvicorn on one socket of ours. It ends when ``should_exit`` is set and by nothing else: signals belong to the
+    daemon. It takes new connections one by one and at a pace: asyncio's own server takes all that wait at once."""
 
-    def __init__(self, config: uvicorn.Config, listener: socket.socket) -> None:
+    def __init__(self, config: uvicorn.Config, listener: socket.socket, limits: ApiLimits) -> None:
         super().__init__(config)
         self._listener = listener
+        self._pace = Pace(limits.accept_rate_hz, ACCEPT_BURST_N)
         self.answering = asyncio.Event()
         self.name = str(listener.getsockname())
 
@@ -210,14 +213,47 @@ class _Server(uvicorn.Server):
         yield
 
     async def run_until_told(self) -> None:
-        await self.serve(sockets=[self._listener])
+        """Serve until ``should_exit``."""
+        serving = asyncio.create_task(self.serve(), name=f"api serve {self.name}")
+        accepting = asyncio.create_task(self._accept(), name=f"api accept {self.name}")
+        try:
+            # Neither ends by itself: the first that does has failed, or was told to.
+            await asyncio.wait((accepting, serving), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            self.should_exit = True
+            accepting.cancel()
+            results = await asyncio.gather(accepting, serving, return_exceptions=True)
+        for result in results:
+            if isinstance(result, Exception):
+                raise result
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        await super().startup(sockets)
-        # asyncio takes as many connections in one turn of the loop as the backlog it was told: few. The kernel may
-        # let more of them wait.
+        """Take part in uvicorn's start without a listener of its own."""
+        del sockets
+        await self.lifespan.startup()
+        self.servers = []
+        self.started = True
         self._listener.listen(LISTEN_QUEUE_N)
         self.answering.set()
+
+    async def _accept(self) -> None:
+        loop = asyncio.get_running_loop()
+        await self.answering.wait()
+        while True:
+            try:
+                connection, _ = await loop.sock_accept(self._listener)
+            except ConnectionError:
+                continue
+            except OSError as error:
+                logging.getLogger(__name__).warning("%s: no connection taken: %s", self.name, error)
+                await asyncio.sleep(ACCEPT_RETRY_S)
+                continue
+            await loop.connect_accepted_socket(self._protocol, connection)
+            await asyncio.sleep(self._pace.delay_s(loop.time()))
+
+    def _protocol(self) -> asyncio.Protocol:
+        protocol = cast("type[H11Protocol]", self.config.http_protocol_class)
+        return protocol(config=self.config, server_state=self.server_state, app_state=self.lifespan.state)
 
 
 def _bounded_http(limits: ApiLimits) -> type[H11Protocol]:

@@ -12,7 +12,8 @@ from fastapi import APIRouter, Query, WebSocket
 from pydantic import TypeAdapter, ValidationError
 from starlette.websockets import WebSocketDisconnect
 
-from graderd.api.http_routes import obey
+from graderd.api.closing import Closing
+from graderd.api.http_routes import StatusTexts, obey
 from graderd.api.port import DaemonPort
 from graderd.api.problem import Problem, ProblemError, problem_of_validation
 from graderd.api.settings import ApiLimits
@@ -27,10 +28,9 @@ UPGRADE_ONLY: dict[int | str, dict[str, Any]] = {
 }
 
 
-def socket_routes(port: DaemonPort, limits: ApiLimits, closing: asyncio.Event) -> APIRouter:
+def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closing: Closing) -> APIRouter:
     """The WebSockets over ``port``; ``closing`` ends them."""
     router = APIRouter(prefix="/v1")
-    texts = _StatusTexts()
     numbers = itertools.count(1)
 
     @router.websocket("/stream")
@@ -65,19 +65,6 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, closing: asyncio.Event) -
         raise _upgrade_needed("jog")
 
     return router
-
-
-class _StatusTexts:
-    """The newest status as JSON, made once however many clients look on."""
-
-    def __init__(self) -> None:
-        self._status: Status | None = None
-        self._text = ""
-
-    def text(self, status: Status) -> str:
-        if status is not self._status:
-            self._status, self._text = status, status.model_dump_json()
-        return self._text
 
 
 class _JogSession:
@@ -124,7 +111,7 @@ class _JogSession:
         return reply
 
 
-async def _send_status(socket: WebSocket, port: DaemonPort, texts: _StatusTexts, rate_hz: float) -> None:
+async def _send_status(socket: WebSocket, port: DaemonPort, texts: StatusTexts, rate_hz: float) -> None:
     """Send the newest status, then wait for a newer one and for the client's rate. ``send_text`` waits while the
     client does not read, and what happened meanwhile is skipped: nothing queues up."""
     loop = asyncio.get_running_loop()
@@ -137,7 +124,7 @@ async def _send_status(socket: WebSocket, port: DaemonPort, texts: _StatusTexts,
         await asyncio.sleep(max(0.0, due_s - loop.time()))
 
 
-async def _until_closed(socket: WebSocket, work: Coroutine[Any, Any, None], closing: asyncio.Event) -> None:
+async def _until_closed(socket: WebSocket, work: Coroutine[Any, Any, None], closing: Closing) -> None:
     """Run ``work`` until it is done, the client goes, or the daemon closes."""
     path = socket.url.path
     tasks = [
@@ -154,7 +141,7 @@ async def _until_closed(socket: WebSocket, work: Coroutine[Any, Any, None], clos
             # RuntimeError is how starlette says that the connection was closed under a send.
             if error is not None and not isinstance(error, WebSocketDisconnect | RuntimeError):
                 raise error
-        if closing.is_set():
+        if closing.begun:
             await socket.close(1001, "the daemon ends")
     finally:
         for task in tasks:

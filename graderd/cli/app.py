@@ -2,33 +2,48 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from typer import Abort, TyperException
 
+from graderd.cli import (
+    calibrate,
+    can,
+    classify,
+    config,
+    demo,
+    explain,
+    guard,
+    jog,
+    modes,
+    preset,
+    profile,
+    rig,
+    rotation,
+    run,
+    status,
+)
 from graderd.cli.console import CliError, ExitCode, print_error, print_text
 from graderd.hal.errors import DeviceError
 
 COMMANDS = (
-    "run",
-    "demo",
-    "rig",
-    "guard",
-    "status",
-    "modes",
-    "jog",
-    "preset",
-    "explain",
-    "config",
-    "rotation",
-    "profile",
-    "can",
-    "classify",
-    "calibrate",
+    run,
+    demo,
+    rig,
+    guard,
+    status,
+    modes,
+    jog,
+    preset,
+    explain,
+    config,
+    rotation,
+    profile,
+    can,
+    classify,
+    calibrate,
 )
 
 
@@ -58,9 +73,8 @@ def make_cli() -> typer.Typer:
             print_text(context.get_help())
             raise typer.Exit(ExitCode.USAGE)
 
-    for name in COMMANDS:
-        if find_spec(f"graderd.cli.{name}") is not None:
-            import_module(f"graderd.cli.{name}").register(app)
+    for command in COMMANDS:
+        command.register(app)
     return app
 
 

@@ -46,7 +46,7 @@ class FakeDaemon:
     )
 
     def __post_init__(self) -> None:
-        self._inbox: list[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = []
+        self.waiting: list[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = []
         self._ticked = asyncio.Event()
         self._moving: set[str] = set()
         self._goals = Goals()
@@ -73,7 +73,7 @@ class FakeDaemon:
 
     async def command(self, command: cmd.Command) -> cmd.Reply:
         future: asyncio.Future[cmd.Reply] = asyncio.get_running_loop().create_future()
-        self._inbox.append((command, future))
+        self.waiting.append((command, future))
         return await future
 
     def config(self) -> dict[str, Any]:
@@ -97,9 +97,9 @@ class FakeDaemon:
         raise ServiceError(f"there is no service {name}", "see /v1/openapi.json")
 
     def _tick(self, now_s: float) -> None:
-        taken = [] if self.frozen else sorted(self._inbox, key=lambda entry: not isinstance(entry[0], cmd.Stop))
+        taken = [] if self.frozen else sorted(self.waiting, key=lambda entry: not isinstance(entry[0], cmd.Stop))
         if taken:
-            self._inbox = []
+            self.waiting = []
         self.seen += [command for command, _ in taken]
         inputs = Inputs(
             now_s=now_s,

@@ -258,3 +258,21 @@ async def test_the_description_is_complete(tmp_path: Path) -> None:
     assert set(body["examples"]) >= {"arm", "stop", "jog"}
     assert {"409", "422", "503", "504"} <= set(paths["/v1/commands"]["post"]["responses"])
     json.dumps(description, allow_nan=False)
+
+
+async def test_requests_that_wait_when_the_daemon_ends_are_answered(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with serving(tmp_path, FakeDaemon(frozen=True)) as (daemon, path):
+        reader, writer = await asyncio.open_unix_connection(str(path))
+        writer.write(
+            b"POST /v1/commands HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+            b'Content-Length: 18\r\n\r\n{"command": "arm"}'
+        )
+        await daemon.until(lambda: bool(daemon.waiting))
+    answer = await within(2, reader.read())
+    assert b" 503 " in answer
+    assert b"the daemon ends" in answer
+    writer.close()
+    await writer.wait_closed()
+    assert [record for record in caplog.records if record.levelname == "ERROR"] == []
