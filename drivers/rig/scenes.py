@@ -132,7 +132,7 @@ def _pour(rng: np.random.Generator, field: SoilField, intended: Label, blade: Bl
             )
         return
     if intended == "even":
-        height_m = float(rng.uniform(0.03, 0.11))
+        height_m = float(rng.uniform(0.045, 0.11))
         depth_m = float(rng.uniform(0.35, 1.2))
         half_m = float(rng.uniform(0.52, 0.8))
         field.add(np.where((np.abs(s) < half_m) & (d > -0.05) & (d < depth_m), height_m, 0.0) * bumps)
