@@ -285,6 +285,7 @@ class ControlLoop:
             self.last_stop = self._state_file.save(after.reason)
         elif after.mode in ARMED and before.mode not in ARMED:
             self._gate = GateState()
+            self.faults = clear_faults(self.faults, Clear.ON_REARM)
 
     def _note_late(self, late_s: float, now_s: float) -> None:
         """The worst of the last moments is told: small delays after a long one must not hide it."""

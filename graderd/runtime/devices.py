@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
 
 from graderd.hal.fault import DeviceFault
 from graderd.hal.linear_actuator import LinearActuator
@@ -33,21 +33,17 @@ class Link(Protocol):
         ...
 
 
-Service = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
-
-
 def _publish_nowhere(faults: tuple[DeviceFault, ...], stopped: bool) -> None:
     """Where there is no bus to tell."""
 
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """Everything that can move, the bus under it, and services outside the control loop by name."""
+    """Everything that can move, and the bus under it."""
 
     rotation: Rotator
     link: Link
     actuators: dict[str, LinearActuator]
-    services: dict[str, Service] = field(default_factory=dict)
     publish_faults: Callable[[tuple[DeviceFault, ...], bool], None] = _publish_nowhere
     """Puts the active faults, and whether the machine is stopped, on the bus as diagnostic messages (DM1)."""
 

@@ -12,6 +12,7 @@ import contextlib
 import logging
 import sys
 from collections import deque
+from pathlib import Path
 
 from pydantic import BaseModel
 
@@ -19,11 +20,23 @@ from graderd.core.blade import BladeGeometry
 from graderd.core.status import CameraStatus
 from graderd.core.zones import SoilObservation
 from graderd.hal.clock import Clock
+from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
-from graderd.runtime.worker_protocol import Angle, FromChild, Observed, Opened, Preview, PreviewRequest, Start, Trouble
+from graderd.runtime.worker_protocol import (
+    Angle,
+    FromChild,
+    Observed,
+    Opened,
+    Preview,
+    PreviewRequest,
+    Saved,
+    SaveFrame,
+    Start,
+    Trouble,
+)
 
 WORKER_MODULE = "graderd.runtime.app.worker"
 START_GRACE_S = 15.0
@@ -74,6 +87,7 @@ class PerceptionWorker:
         self._restarts_n = 0
         self._frame_times: deque[float] = deque(maxlen=30)
         self._preview: asyncio.Future[bytes] | None = None
+        self._saved: asyncio.Future[Saved] | None = None
 
     @property
     def newest(self) -> SoilObservation | None:
@@ -159,6 +173,23 @@ class PerceptionWorker:
         async with asyncio.timeout(timeout_s):
             return await asyncio.shield(self._preview)
 
+    async def save_frame(self, folder: Path, id_: str, blade_angle_deg: float, timeout_s: float = 5.0) -> None:
+        """Have the next frame added to the frame set in ``folder``.
+
+        Raises:
+            DeviceTimeoutError: no frame came.
+            DeviceRefusedError: it could not be written.
+        """
+        self._saved = asyncio.get_running_loop().create_future()
+        self._write(SaveFrame(folder=str(folder), id=id_, blade_angle_deg=blade_angle_deg))
+        try:
+            async with asyncio.timeout(timeout_s):
+                saved = await self._saved
+        except TimeoutError:
+            raise DeviceTimeoutError("camera", f"no frame within {timeout_s:g} s", "See graderd status") from None
+        if saved.problem:
+            raise DeviceRefusedError("camera", f"the frame could not be saved: {saved.problem}")
+
     def _write(self, message: BaseModel) -> None:
         process = self._process
         if process is None or process.stdin is None or process.stdin.is_closing():
@@ -230,7 +261,7 @@ class PerceptionWorker:
             log.warning("perception worker sent what cannot be true (%s): killing it", detail)
             return False
 
-    def _take(self, message: Opened | Observed | Trouble | Preview) -> bool:
+    def _take(self, message: Opened | Observed | Trouble | Preview | Saved) -> bool:
         if isinstance(message, Observed):
             observation = message.unpack()
             if observation.capture_s > self._last_word_s + FUTURE_S:
@@ -252,6 +283,9 @@ class PerceptionWorker:
             # does not count against it, or none that starts slowly would ever get to its first frame.
             waiting_s = self._clock.now_s() - max(self._no_frame_since_s, self._opened_s)
             return not message.final and waiting_s < self._camera.restart_s
+        elif isinstance(message, Saved):
+            if self._saved is not None and not self._saved.done():
+                self._saved.set_result(message)
         elif self._preview is not None and not self._preview.done():
             self._preview.set_result(base64.b64decode(message.jpeg_base64))
         return True

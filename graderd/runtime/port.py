@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 from graderd.api.port import ServiceError
@@ -14,14 +15,16 @@ from graderd.runtime.control import ControlLoop
 from graderd.runtime.perception import PerceptionWorker
 from graderd.runtime.status import build_status
 
+Service = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 SERVICES_IN_ANY_MODE = frozenset({"rotation.verify_profile"})
 
 
 class Port:
     """Status is built once per tick and only when somebody waits for it."""
 
-    def __init__(self, loop: ControlLoop, eyes: PerceptionWorker) -> None:
+    def __init__(self, loop: ControlLoop, eyes: PerceptionWorker, services: Mapping[str, Service]) -> None:
         self._loop = loop
+        self._services = services
         self._eyes = eyes
         self._waiting: list[asyncio.Future[Status]] = []
         self._cached: Status | None = None
@@ -67,9 +70,9 @@ class Port:
 
     async def service(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """Run a device service; those that move or unpower need manual or disarmed mode and consent."""
-        service = self._loop.devices.services.get(name)
+        service = self._services.get(name)
         if service is None:
-            known = ", ".join(sorted(self._loop.devices.services))
+            known = ", ".join(sorted(self._services))
             raise ServiceError(f"there is no service '{name}'", f"there are: {known}")
         arguments = dict(arguments)
         consent = bool(arguments.pop("consent", False))

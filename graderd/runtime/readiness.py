@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from graderd.core.faults import Reaction
+from graderd.core.faults import ActiveFault, Clear, Reaction
 from graderd.core.machine import Mode, Unmet
 from graderd.hal.lifecycle import Lifecycle
 
@@ -41,7 +41,7 @@ def requirements(loop: ControlLoop, now_s: float) -> tuple[Requirement, ...]:
     for name in loop.devices.all():
         found.append(_connected(loop, name))
         found.append(_inside_limits(loop, name, measured[name]))
-    blocking = [f for f in loop.faults.active if f.present and f.row.reaction >= Reaction.DISARM]
+    blocking = [f for f in loop.faults.active if f.present and _blocks(f)]
     found += [Requirement(f.name, False, True, f.detail or f.row.reads, f.row.remedy) for f in blocking]
     camera = [f for f in loop.faults.active if f.name.startswith("camera.") and f.present]
     found.append(
@@ -54,6 +54,12 @@ def requirements(loop: ControlLoop, now_s: float) -> tuple[Requirement, ...]:
         )
     )
     return tuple(found)
+
+
+def _blocks(fault: ActiveFault) -> bool:
+    """An arm while it is present would be refused by the device, or would not end the latch it is meant to end."""
+    row = fault.row
+    return row.reaction >= Reaction.DISARM or (row.reaction is Reaction.HOLD and row.clear is Clear.ON_REARM)
 
 
 def _not_stopped(loop: ControlLoop) -> Requirement:

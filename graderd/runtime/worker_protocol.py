@@ -1,7 +1,8 @@
 """What the daemon and its perception child say to each other: one JSON object a line, both ways.
 
-To the child: first a :class:`Start`, then ``Angle`` at the control rate and ``PreviewRequest`` when someone looks.
-From the child: ``Opened``, ``Observed`` for every frame, ``Trouble``, ``Preview``.
+To the child: first a :class:`Start`, then ``Angle`` at the control rate ``PreviewRequest`` when someone looks,
+``SaveFrame`` while calibrating. From the child: ``Opened``, ``Observed`` for every frame, ``Trouble``, ``Preview``,
+``Saved``.
 """
 
 from __future__ import annotations
@@ -47,6 +48,23 @@ class PreviewRequest(_Message):
     """Send the next frame's annotated picture."""
 
     kind: Literal["preview"] = "preview"
+
+
+class SaveFrame(_Message):
+    """Add the next frame to the frame set in ``folder``, taken at ``blade_angle_deg``."""
+
+    kind: Literal["save_frame"] = "save_frame"
+    folder: str
+    id: str
+    blade_angle_deg: float
+
+
+class Saved(_Message):
+    """A frame was saved; ``problem`` says why not, where it could not."""
+
+    kind: Literal["saved"] = "saved"
+    id: str
+    problem: str = ""
 
 
 class Opened(_Message):
@@ -104,7 +122,9 @@ class Preview(_Message):
     jpeg_base64: str
 
 
-ToChild = TypeAdapter[Angle | PreviewRequest](Annotated[Angle | PreviewRequest, Field(discriminator="kind")])
-FromChild = TypeAdapter[Opened | Observed | Trouble | Preview](
-    Annotated[Opened | Observed | Trouble | Preview, Field(discriminator="kind")]
+ToChild = TypeAdapter[Angle | PreviewRequest | SaveFrame](
+    Annotated[Angle | PreviewRequest | SaveFrame, Field(discriminator="kind")]
+)
+FromChild = TypeAdapter[Opened | Observed | Trouble | Preview | Saved](
+    Annotated[Opened | Observed | Trouble | Preview | Saved, Field(discriminator="kind")]
 )

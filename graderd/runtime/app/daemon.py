@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+from drivers.dynamixel.ph54 import Ph54Rotator
 from graderd.api import make_app
 from graderd.api.server import serve
 from graderd.config import Config, ConfigError, load
@@ -19,6 +20,7 @@ from graderd.core.machine import Mode
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
 from graderd.runtime.app.devices import build_devices
+from graderd.runtime.app.services import build_services
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.health import HealthWatch
@@ -84,7 +86,9 @@ class Daemon:
         self._eyes = PerceptionWorker(config.camera, config.camera.calibration, config.perception, config.blade, clock)
         self._devices = build_devices(config, clock, on_bus_stop=self._stop_from_bus)
         self._loop = ControlLoop(config, self._devices, self._eyes, clock, StateFile(config.state.directory))
-        self._port = Port(self._loop, self._eyes)
+        rotator = self._devices.rotation
+        assert isinstance(rotator, Ph54Rotator)  # build_devices made it
+        self._port = Port(self._loop, self._eyes, build_services(config, rotator, self._loop, self._eyes))
         self._recorder = Recorder(config)
         self._health = HealthWatch(config)
         self._loop.extra_faults += [self._recorder.faults, self._health.faults]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
-from typing import Any
 
 from drivers.dynamixel.ph54 import Ph54Rotator
 from drivers.electrak.actuator import ElectrakActuator
@@ -24,13 +22,6 @@ def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], Non
         name: ElectrakActuator(name, getattr(config, name), link, clock) for name in ACTUATOR_NAMES
     }
 
-    async def verify_profile(_: dict[str, Any]) -> dict[str, Any]:
-        return {"differences": [asdict(difference) for difference in await rotator.verify_profile()]}
-
-    async def reboot(_: dict[str, Any]) -> dict[str, Any]:
-        await rotator.reboot()
-        return {"rebooted": True}
-
     def publish(faults: tuple[DeviceFault, ...], stopped: bool) -> None:
         link.publish_faults(faults, stopped=stopped)
 
@@ -38,6 +29,5 @@ def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], Non
         rotation=rotator,
         link=link,
         actuators=actuators,
-        services={"rotation.verify_profile": verify_profile, "rotation.reboot": reboot},
         publish_faults=publish,
     )

@@ -7,21 +7,35 @@ from __future__ import annotations
 
 import base64
 import os
+import queue
 import sys
 import threading
 from bisect import bisect_left
 from collections import deque
+from pathlib import Path
 from typing import BinaryIO
 
 import cv2
 from pydantic import BaseModel, ValidationError
 
-from graderd.hal.camera import Camera, EndOfFrames, Frame
+from graderd.hal.camera import Camera, EndOfFrames, Frame, Intrinsics
 from graderd.hal.errors import DeviceError, DeviceTimeoutError
 from graderd.hal.settings import CameraSettings
 from graderd.perception import Classifier, make_classifier
+from graderd.perception.frame_set import Entry, FrameSetWriter
+from graderd.perception.settings import CameraCalibration, StreamCalibration
 from graderd.runtime.app.frame_sources import open_camera
-from graderd.runtime.worker_protocol import Angle, Observed, Opened, Preview, Start, ToChild, Trouble
+from graderd.runtime.worker_protocol import (
+    Angle,
+    Observed,
+    Opened,
+    Preview,
+    Saved,
+    SaveFrame,
+    Start,
+    ToChild,
+    Trouble,
+)
 
 JPEG_QUALITY = 80
 
@@ -63,6 +77,8 @@ class Worker:
         self._out = out
         self._angles = AngleHistory()
         self._preview_wanted = threading.Event()
+        self._to_save: queue.SimpleQueue[SaveFrame] = queue.SimpleQueue()
+        self._writers: dict[str, FrameSetWriter] = {}
 
     def _send(self, message: BaseModel) -> None:
         self._out.write(message.model_dump_json().encode() + b"\n")
@@ -74,6 +90,8 @@ class Worker:
             message = ToChild.validate_json(line)
             if isinstance(message, Angle):
                 self._angles.add(message.time_s, message.angle_deg)
+            elif isinstance(message, SaveFrame):
+                self._to_save.put(message)
             else:
                 self._preview_wanted.set()
         os._exit(0)
@@ -120,15 +138,52 @@ class Worker:
             angle_deg, age_s = self._angles.at(frame.capture_s)
             observation = classifier.classify(frame, angle_deg, age_s)
             self._send(Observed.of(observation))
+            if not self._to_save.empty():
+                self._save(self._to_save.get(), frame)
             if self._preview_wanted.is_set():
                 self._preview_wanted.clear()
                 self._send(Preview(jpeg_base64=_jpeg(classifier, frame, observation)))
+
+    def _save(self, wanted: SaveFrame, frame: Frame) -> None:
+        problem = ""
+        try:
+            if wanted.folder not in self._writers:
+                calibration = with_lens_of(frame, self._start.calibration)
+                self._writers[wanted.folder] = FrameSetWriter(Path(wanted.folder), calibration, self._start.blade)
+            self._writers[wanted.folder].add(Entry(wanted.id, None, wanted.blade_angle_deg), frame)
+        except OSError as error:
+            problem = f"{wanted.folder}: {error.strerror}"
+        self._send(Saved(id=wanted.id, problem=problem))
 
 
 def _jpeg(classifier: Classifier, frame: Frame, observation: object) -> str:
     picture = classifier.annotate(frame, observation)  # type: ignore[arg-type]  # same observation as just made
     ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return base64.b64encode(data.tobytes()).decode() if ok else ""
+
+
+def with_lens_of(frame: Frame, calibration: CameraCalibration) -> CameraCalibration:
+    """The calibration's poses with the lens data the frame came with, where it has them."""
+
+    def lens(stream: StreamCalibration, told: Intrinsics | None) -> StreamCalibration:
+        if told is None:
+            return stream
+        changes = {
+            "width_px": told.width,
+            "height_px": told.height,
+            "fx_px": told.fx,
+            "fy_px": told.fy,
+            "cx_px": told.cx,
+            "cy_px": told.cy,
+            "distortion_n": told.coeffs,
+        }
+        return stream.model_copy(update=changes)
+
+    changes = {
+        "color": lens(calibration.color, frame.color_intrinsics),
+        "depth": lens(calibration.depth, frame.depth_intrinsics),
+    }
+    return calibration.model_copy(update=changes)
 
 
 def settings_not_kept(settings: CameraSettings, read_back: dict[str, float]) -> tuple[str, ...]:

@@ -1,0 +1,144 @@
+"""Device services outside the control loop: read the servo's profile, reboot it, step response, camera calibration."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import asdict
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import Field, ValidationError
+
+from drivers.dynamixel.ph54 import Ph54Rotator
+from drivers.dynamixel.step import StepSample, analyse
+from drivers.dynamixel.step_report import render
+from graderd.config import Config
+from graderd.hal.errors import CommandRangeError, DeviceMissingError
+from graderd.hal.settings import Finite, Positive, Settings
+from graderd.runtime.control import ControlLoop
+from graderd.runtime.maneuver import Maneuver
+from graderd.runtime.perception import PerceptionWorker
+from graderd.runtime.port import Service
+
+T = TypeVar("T", bound=Settings)
+STEP_SHARES = (1.0, 0.5, 0.0, 0.5, 0.0)
+"""Up, half-way down, down, half-way up, back: the half-way goal is reached from both sides, which shows backlash."""
+SETTLE_S = 0.5
+
+
+class StepArguments(Settings):
+    """Arguments of ``rotation.step_response``."""
+
+    step_deg: Finite = 10.0
+    dwell_s: Positive = Field(2.5, le=20.0)
+
+
+class CalibrateArguments(Settings):
+    """Arguments of ``camera.calibrate``."""
+
+    angles_deg: tuple[Finite, ...] = Field((-40.0, -20.0, 0.0, 20.0, 40.0), min_length=2, max_length=20)
+
+
+def build_services(
+    config: Config, rotator: Ph54Rotator, loop: ControlLoop, eyes: PerceptionWorker
+) -> dict[str, Service]:
+    """The services by name. Each takes the request's arguments and returns a JSON object."""
+
+    async def verify_profile(_: dict[str, Any]) -> dict[str, Any]:
+        return {"differences": [asdict(difference) for difference in await rotator.verify_profile()]}
+
+    async def reboot(_: dict[str, Any]) -> dict[str, Any]:
+        await rotator.reboot()
+        return {"rebooted": True}
+
+    async def step_response(arguments: dict[str, Any]) -> dict[str, Any]:
+        wanted = _checked(StepArguments, arguments)
+        return await _step_response(config, rotator, loop, wanted)
+
+    async def calibrate(arguments: dict[str, Any]) -> dict[str, Any]:
+        wanted = _checked(CalibrateArguments, arguments)
+        return await _collect_frames(loop, eyes, wanted)
+
+    return {
+        "rotation.verify_profile": verify_profile,
+        "rotation.reboot": reboot,
+        "rotation.step_response": step_response,
+        "camera.calibrate": calibrate,
+    }
+
+
+async def _step_response(
+    config: Config, rotator: Ph54Rotator, loop: ControlLoop, wanted: StepArguments
+) -> dict[str, Any]:
+    """Steps through machine and gate: what is measured is what the blade does in operation."""
+    samples: list[StepSample] = []
+    async with Maneuver(loop) as blade:
+        start_deg = loop.pose(loop.time_s).rotation_deg
+        if start_deg is None:
+            raise DeviceMissingError("rotation", "no fresh measurement to start from")
+        began_s = loop.time_s
+
+        def sample(goal_deg: float) -> None:
+            told = rotator.telemetry()
+            if told.angle_deg and told.velocity_deg_per_s and told.current_a:
+                samples.append(
+                    StepSample(
+                        told.angle_deg.time_s - began_s,
+                        goal_deg,
+                        told.angle_deg.value,
+                        told.velocity_deg_per_s.value,
+                        told.current_a.value,
+                    )
+                )
+
+        for share in (0.0, *STEP_SHARES):
+            goal_deg = start_deg + share * wanted.step_deg
+            await blade.rotate_to(goal_deg, wanted.dwell_s, partial(sample, goal_deg))
+    gate = config.gate
+    settings = {
+        "gate speed": f"{gate.rotation_speed_deg_per_s:g} deg/s",
+        "gate acceleration": f"{gate.rotation_acceleration_deg_per_s2:g} deg/s²",
+        "profile velocity": f"{config.rotation.velocity_deg_per_s:g} deg/s",
+        "profile acceleration": f"{config.rotation.acceleration_deg_per_s2:g} deg/s²",
+        "current limit": f"{config.rotation.current_limit_a:g} A",
+        "simulated": str(config.simulated),
+    }
+    recording = analyse(samples, config.rotation.in_position_deg, settings)
+    return {
+        "steps": [asdict(step) for step in recording.steps],
+        "backlash_deg": recording.backlash_deg,
+        "backlash_from": recording.backlash_from,
+        "settings": settings,
+        "report_html": render(recording, when=datetime.now(UTC).isoformat(timespec="seconds")),
+    }
+
+
+async def _collect_frames(loop: ControlLoop, eyes: PerceptionWorker, wanted: CalibrateArguments) -> dict[str, Any]:
+    """Turn the empty blade to each angle and save one frame there, as a frame set."""
+    limits = loop.config.gate.limits()["rotation"]
+    for angle_deg in wanted.angles_deg:
+        if not limits.low <= angle_deg <= limits.high:
+            raise CommandRangeError("angles_deg", f"{angle_deg:g} is outside {limits.low:g} to {limits.high:g} deg")
+    base = os.environ.get("STATE_DIRECTORY") or None
+    folder = Path(tempfile.mkdtemp(prefix="calibration-", dir=base))
+    turn_s = max(abs(b - a) for a, b in zip((0.0, *wanted.angles_deg), wanted.angles_deg, strict=False))
+    dwell_s = turn_s / limits.speed + limits.speed / limits.acceleration + 3 * SETTLE_S
+    async with Maneuver(loop) as blade:
+        for number, angle_deg in enumerate(wanted.angles_deg):
+            await blade.rotate_to(angle_deg, dwell_s)
+            measured_deg = loop.pose(loop.time_s).rotation_deg
+            if measured_deg is None:
+                raise DeviceMissingError("rotation", "no fresh measurement while calibrating")
+            await eyes.save_frame(folder, f"{number:03d}", measured_deg)
+    return {"frame_set": str(folder), "frames_n": len(wanted.angles_deg)}
+
+
+def _checked(model: type[T], arguments: dict[str, Any]) -> T:
+    try:
+        return model.model_validate(arguments)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CommandRangeError(".".join(map(str, first["loc"])) or "arguments", first["msg"]) from None

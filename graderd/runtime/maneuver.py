@@ -1,0 +1,79 @@
+"""A maneuver of the daemon itself (step response, calibration): an operator like any other, through machine and gate.
+
+It arms, moves by jogs whose lease it renews, and disarms on the way out whatever happened. Stop, faults and every
+limit act on it as on anybody.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from graderd.core import commands as cmd
+from graderd.core.machine import Mode
+from graderd.hal.errors import DeviceLostError, DeviceRefusedError
+from graderd.runtime.control import ControlLoop
+
+CLIENT = "maneuver"
+SAMPLE_S = 0.02
+RENEW_S = 0.1
+ARM_TIMEOUT_S = 10.0
+
+
+class Maneuver:
+    """``async with Maneuver(loop) as blade: await blade.rotate_to(...)``. The caller has a person's consent."""
+
+    def __init__(self, loop: ControlLoop) -> None:
+        self._loop = loop
+
+    async def __aenter__(self) -> Self:
+        """Arm.
+
+        Raises:
+            DeviceRefusedError: not ready, or arming failed; the message says why.
+        """
+        await self._obey(cmd.Arm(client=CLIENT))
+        try:
+            async with asyncio.timeout(ARM_TIMEOUT_S):
+                while self._loop.state.mode is not Mode.MANUAL:
+                    if self._loop.state.arming_since_s is None:
+                        raise DeviceRefusedError("arm", self._loop.state.reason)
+                    await asyncio.sleep(SAMPLE_S)
+        except TimeoutError:
+            raise DeviceRefusedError("arm", f"not armed within {ARM_TIMEOUT_S:g} s") from None
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._loop.command(cmd.Disarm(client=CLIENT))
+
+    async def rotate_to(self, angle_deg: float, dwell_s: float, each: Callable[[], None] | None = None) -> None:
+        """Go to ``angle_deg`` and stay until ``dwell_s`` after the start; ``each`` is called every 20 ms.
+
+        Raises:
+            DeviceRefusedError: beyond a limit, or another client is moving the blade.
+            DeviceLostError: the machine left manual mode (stop, fault) under way.
+        """
+        await self._obey(cmd.Jog(axis="rotate", value=angle_deg, client=CLIENT))
+        clock = asyncio.get_running_loop().time
+        end_s = clock() + dwell_s
+        renew_s = clock() + RENEW_S
+        while clock() < end_s:
+            if self._loop.state.mode is not Mode.MANUAL:
+                raise DeviceLostError("maneuver", f"ended under way: {self._loop.state.reason}")
+            if clock() >= renew_s:
+                renew_s = clock() + RENEW_S
+                if not (await self._loop.command(cmd.Renew(client=CLIENT))).accepted:
+                    # A late renewal on a loaded machine: the blade held meanwhile; ask again.
+                    await self._obey(cmd.Jog(axis="rotate", value=angle_deg, client=CLIENT))
+            if each is not None:
+                each()
+            await asyncio.sleep(SAMPLE_S)
+
+    async def _obey(self, command: cmd.Command) -> None:
+        reply = await self._loop.command(command)
+        if not reply.accepted:
+            raise DeviceRefusedError(reply.command, reply.message, reply.remedy)
