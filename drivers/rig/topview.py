@@ -31,7 +31,7 @@ def top_view(
     size = (heights_m.shape[1] * _SCALE, heights_m.shape[0] * _SCALE)
     fine = cv2.resize(heights_m.astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
     slope_x, slope_y = np.gradient(fine, cell_m / _SCALE)
-    light = np.clip(0.75 - 0.5 * slope_x + 0.5 * slope_y, 0.25, 1.5)
+    light = np.clip(1.0 - 0.45 * slope_x + 0.45 * slope_y, 0.4, 1.5)
     soil = soil_palette(look)[128, 0].astype(np.float32)
     floor = ground_palette(look)[128, 0].astype(np.float32)
     share = np.clip((fine - 0.002) / 0.01, 0.0, 1.0)[:, :, None]
