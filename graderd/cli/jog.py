@@ -150,7 +150,7 @@ def move(
                 if elapsed_s >= timeout_s:
                     raise CliError(name, f"not there after {timeout_s:g} s: {arrival.where()}", "see graderd status")
                 time.sleep(RENEW_S)
-                _ask(lease, {"command": "renew"}, stream)
+                _renew(lease, daemon)
         except KeyboardInterrupt:
             interrupted = True
         _ask(lease, {"command": "release"}, may_refuse=True)
@@ -217,7 +217,6 @@ def _axis_text(axis: dict[str, Any]) -> str:
 def _ask(
     lease: ClientConnection,
     command: dict[str, Any],
-    stream: ClientConnection | None = None,
     may_refuse: bool = False,
 ) -> None:
     """Send one command on the jog socket and wait for its reply."""
@@ -228,12 +227,18 @@ def _ask(
         raise CliError(command["command"], "the daemon did not answer", "see its log") from None
     if reply.get("accepted") or may_refuse:
         return
-    why, remedy = reply.get("message") or reply.get("error", ""), reply.get("remedy", "")
-    status = None if stream is None else _newest(stream)
-    if status is not None:
-        # A renewal is refused when the lease is gone; the machine's own reason says why it went.
-        why, remedy = f"{why}: {status['mode']}, {status['reason']}", "see graderd status"
-    raise CliError(command["command"], why, remedy)
+    raise CliError(command["command"], reply.get("message") or reply.get("error", ""), reply.get("remedy", ""))
+
+
+def _renew(lease: ClientConnection, daemon: Daemon) -> None:
+    """Keep the lease. Where it is gone, the machine's own reason says why."""
+    try:
+        _ask(lease, {"command": "renew"})
+    except CliError as error:
+        status = daemon.get("/v1/status")
+        raise CliError(
+            "jog", f"ended on the way: {status['mode']}, {status['reason']}", "see graderd status"
+        ) from error
 
 
 def _first(stream: ClientConnection) -> dict[str, Any]:

@@ -55,7 +55,7 @@ def register(app: typer.Typer) -> None:
         if json:
             print_json(answer)
         else:
-            print_table("Step response", ("", ""), [(name, _text(value)) for name, value in answer.items()])
+            _print_answer(answer)
             if report is not None:
                 print_text(f"report: {report}")
 
@@ -83,5 +83,17 @@ def _write(report: Path, page: Any) -> None:
         raise CliError(str(report), f"cannot be written: {error.strerror}", "choose another --report") from error
 
 
+def _print_answer(answer: dict[str, Any]) -> None:
+    """Single values in one table, each list of records in a table of its own."""
+    lists = {name: value for name, value in answer.items() if isinstance(value, list) and value}
+    rows = [(name, _text(value)) for name, value in answer.items() if name not in lists]
+    for name, records in lists.items():
+        header = tuple(records[0])
+        print_table(name, header, [tuple(_text(record.get(column)) for column in header) for record in records])
+    print_table("Step response", ("", ""), rows)
+
+
 def _text(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_text(entry)}" for name, entry in value.items())
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -53,7 +53,7 @@ async def test_the_tick_goes_on_and_stop_gets_through(
         assert counts["503"] > 0
     # This machine may be busy with other things; without the limits the median itself is beyond a tick.
     assert late_s[len(late_s) // 2] < TICK_S / 2
-    assert late_s[int(len(late_s) * 0.9)] < 2 * TICK_S
+    assert late_s[int(len(late_s) * 0.9)] < 3 * TICK_S
     limits = ApiLimits()
     assert tasks_n < 3 * limits.connections_max_n
     assert [record for record in caplog.records if record.levelname in ("ERROR", "CRITICAL")] == []

@@ -146,7 +146,7 @@ async def test_a_stop_ends_the_jog_and_the_command_says_why(tmp_path: Path, caps
         assert await cli(path, "stop", "--reason", "enough") == 0
         assert await within(10, jog) == 1
         said = capsys.readouterr().err
-        assert "stopped, enough" in said
+        assert "ended on the way: stopped, enough" in said
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
