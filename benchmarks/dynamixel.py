@@ -3,7 +3,8 @@
 ``python benchmarks/dynamixel.py [--seconds S] [--json]``. For each baud rate the virtual servo runs in a process of
 its own and answers as late as a real wire would (request bytes, the factory's 500 µs return delay, reply bytes). Each
 client runs in a process of its own too, on an asyncio loop with a 5 ms ticker beside it: ours natively, the others in
-a thread, as an asyncio program would have to. One transaction reads 25 bytes: our telemetry block; rustypot, whose
+a thread, as an asyncio program would have to. What the ticker alone takes is taken off their CPU. One
+transaction reads 25 bytes: our telemetry block; rustypot, whose
 addresses end at 255, reads as many from address 0.
 
 The bars: at least 90 % of what the wire allows, and at most a tenth of the SDK's CPU at the same rate.
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 BAUDS = (57_600, 1_000_000)
+NOTHING = "the ticker alone"
 CLIENTS = ("graderd", "dynamixel-sdk in a thread", "rustypot in a thread")
 REQUEST_BYTES, REPLY_BYTES, BLOCK_BYTES = 14, 36, 25
 RETURN_DELAY_S = 500e-6
@@ -90,8 +92,18 @@ async def _rustypot(port: str, baud_n: int) -> tuple[Callable[[], Awaitable[bool
     return in_thread, bus.close
 
 
+async def _nothing(port: str, baud_n: int) -> tuple[Callable[[], Awaitable[bool]], Callable[[], None]]:
+    del port, baud_n
+
+    async def once() -> bool:
+        await asyncio.sleep(0.1)
+        return True
+
+    return once, lambda: None
+
+
 async def _measure(client: str, port: str, baud_n: int, seconds: float, rate_hz: float | None) -> dict[str, float]:
-    make = dict(zip(CLIENTS, (_ours, _sdk, _rustypot), strict=True))[client]
+    make = dict(zip((*CLIENTS, NOTHING), (_ours, _sdk, _rustypot, _nothing), strict=True))[client]
     once, close = await make(port, baud_n)
     for _ in range(20):
         await once()
@@ -131,7 +143,6 @@ async def _measure(client: str, port: str, baud_n: int, seconds: float, rate_hz:
         "rate_hz": good_n / spent_s,
         "errors_n": bad_n,
         "cpu_percent": 100 * cpu_s / spent_s,
-        "cpu_us_per_transaction": 1e6 * cpu_s / max(1, good_n),
         "transaction_p50_ms": 1e3 * times_s[len(times_s) // 2],
         "transaction_p99_ms": 1e3 * times_s[int(len(times_s) * 0.99)],
         "loop_late_p99_ms": 1e3 * late_s[int(len(late_s) * 0.99)],
@@ -145,6 +156,7 @@ async def _measure(client: str, port: str, baud_n: int, seconds: float, rate_hz:
 def run(seconds: float) -> dict[str, Any]:
     """All clients at all rates; the result as plain data."""
     rows = []
+    ticker_percent = _client(NOTHING, "", 0, seconds, None)["cpu_percent"]
     with tempfile.TemporaryDirectory() as folder:
         for baud_n in BAUDS:
             link = Path(folder) / f"servo{baud_n}"
@@ -168,7 +180,7 @@ def run(seconds: float) -> dict[str, Any]:
                 servo.stdout.readline()
                 for client in CLIENTS:
                     for rate_hz in (None, SAME_RATE_HZ):
-                        rows.append(_row(client, str(link), baud_n, seconds, rate_hz))
+                        rows.append(_row(client, str(link), baud_n, seconds, rate_hz, ticker_percent))
             finally:
                 servo.terminate()
                 servo.wait()
@@ -176,26 +188,31 @@ def run(seconds: float) -> dict[str, Any]:
     return {"load_average": os.getloadavg()[0], "cpus_n": os.cpu_count(), "rows": rows, "bars": bars}
 
 
-def _row(client: str, port: str, baud_n: int, seconds: float, rate_hz: float | None) -> dict[str, Any]:
-    command = [
-        sys.executable,
-        __file__,
-        "--client",
-        client,
-        "--port",
-        port,
-        "--baud",
-        str(baud_n),
-        "--seconds",
-        str(seconds),
-    ]
+def _client(client: str, port: str, baud_n: int, seconds: float, rate_hz: float | None) -> dict[str, float]:
+    command = [sys.executable, __file__, "--client", client, "--port", port, "--baud", str(baud_n)]
+    command += ["--seconds", str(seconds)]
     if rate_hz is not None:
         command += ["--rate", str(rate_hz)]
-    measured = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    measured: dict[str, float] = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    return measured
+
+
+def _row(
+    client: str, port: str, baud_n: int, seconds: float, rate_hz: float | None, ticker_percent: float
+) -> dict[str, Any]:
+    measured = _client(client, port, baud_n, seconds, rate_hz)
     limit_hz = wire_limit_hz(baud_n)
-    row = {"client": client, "baud_n": baud_n, "asked_hz": rate_hz, "wire_limit_hz": limit_hz, **measured}
-    row["of_limit_percent"] = 100 * measured["rate_hz"] / limit_hz
-    return row
+    cpu_percent = max(0.01, measured["cpu_percent"] - ticker_percent)
+    return {
+        **measured,
+        "client": client,
+        "baud_n": baud_n,
+        "asked_hz": rate_hz,
+        "wire_limit_hz": limit_hz,
+        "of_limit_percent": 100 * measured["rate_hz"] / limit_hz,
+        "cpu_percent": cpu_percent,
+        "cpu_us_per_transaction": 1e4 * cpu_percent / max(1e-9, measured["rate_hz"]),
+    }
 
 
 def _bars(rows: list[dict[str, Any]], baud_n: int) -> dict[str, Any]:
@@ -238,7 +255,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=5.0, help="of each measurement (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
-    parser.add_argument("--client", choices=CLIENTS, help=argparse.SUPPRESS)
+    parser.add_argument("--client", choices=(*CLIENTS, NOTHING), help=argparse.SUPPRESS)
     parser.add_argument("--port", help=argparse.SUPPRESS)
     parser.add_argument("--baud", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--rate", type=float, help=argparse.SUPPRESS)

@@ -31,7 +31,7 @@ BusLog = Callable[[float, Literal["tx", "rx"], bytes], None]
 _BITS_PER_BYTE = 10
 _STATUS_BYTES = 11  # a status packet without data
 _PING_DATA_BYTES = 3
-_ALLOWANCE_MIN_S = 0.012
+_ALLOWANCE_MIN_S = 0.020
 _ALLOWANCE_START_S = 0.060
 _ALLOWANCE_MAX_S = 0.100
 """Bounds of what a reply may take beyond wire time: scheduling at the low end, a bad USB adapter at the high one."""
@@ -298,7 +298,7 @@ class ServoBus:
         self._spread_s += 0.25 * (abs(extra_s - self._smooth_s) - self._spread_s)
         self._smooth_s += 0.125 * (extra_s - self._smooth_s)
         self._allowance_s = min(
-            _ALLOWANCE_MAX_S, max(_ALLOWANCE_MIN_S, self._smooth_s + 4 * self._spread_s + 0.5 * _ALLOWANCE_MIN_S)
+            _ALLOWANCE_MAX_S, max(_ALLOWANCE_MIN_S, self._smooth_s + 4 * self._spread_s + 0.25 * _ALLOWANCE_MIN_S)
         )
 
     def _on_deadline(self, reply: asyncio.Future[Packet | None]) -> None:

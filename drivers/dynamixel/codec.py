@@ -218,7 +218,7 @@ class StreamDecoder:
         buffer = self._buffer
         buffer += data
         packets: list[Packet] = []
-        while True:
+        while buffer:
             start = buffer.find(HEADER)
             if start:  # -1 (none) or bytes before it
                 self._drop(start if start > 0 else len(buffer) - _header_prefix(buffer))
@@ -244,6 +244,7 @@ class StreamDecoder:
                 continue
             del buffer[:end]
             packets.append(packet)
+        return packets
 
     def _drop(self, count: int) -> None:
         self.stray_n += count
