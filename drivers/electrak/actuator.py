@@ -118,9 +118,10 @@ class ElectrakActuator:
         )
 
     def faults(self) -> tuple[DeviceFault, ...]:
-        """Conditions present now; latched ones until the next arm."""
-        self._watch(self._clock.now_s())
-        return self._faults.all()
+        """Conditions present now; those that latch stay until the next arm, marked as latched once they are over."""
+        now_s = self._clock.now_s()
+        self._watch(now_s)
+        return self._faults.all(now_s, self._feedback.flags if self._feedback else frozenset())
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -173,7 +174,7 @@ class ElectrakActuator:
         self._faults.clear(*(LATCHING - set(standing)))
         left = self._faults.names() - INFORMATIVE
         if left:
-            details = "; ".join(f.detail for f in self._faults.all() if f.condition in left)
+            details = "; ".join(f.detail for f in self._faults.all(now_s) if f.condition in left)
             raise DeviceRefusedError(self.name, f"cannot arm with {', '.join(sorted(left))}: {details}")
         self._planner.hold()
         self._monitor.reset(now_s)
@@ -410,7 +411,10 @@ class ElectrakActuator:
                 return "Arm it first"
             case Lifecycle.ACTIVE:
                 return "It is active already"
-        return "; ".join(fault.detail for fault in self._faults.all()) or "Wait until its feedback is back"
+        return (
+            "; ".join(fault.detail for fault in self._faults.all(self._clock.now_s()))
+            or "Wait until its feedback is back"
+        )
 
     def _no_feedback_error(self) -> DeviceError:
         now_s = self._clock.now_s()

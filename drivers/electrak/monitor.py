@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+from dataclasses import replace
 from typing import Final
 
 from drivers.electrak.codec import Feedback
@@ -20,6 +21,8 @@ _BAD_N: Final = 3
 _BAD_WINDOW_S: Final = 1.0
 _FLOOD_FACTOR: Final = 1.7
 _RATE_N: Final = 20
+_SHOWN_S: Final = 1.0
+"""An event counts as present for so long, that nobody who looks now and then misses it."""
 
 LATCHING: Final = frozenset({"overload", "fatal", "restarted", "uncommanded_motion", "not_moving"})
 """Conditions that stay until the axis is armed again."""
@@ -44,10 +47,12 @@ class FaultMemory:
     def __init__(self, device: str) -> None:
         self._device = device
         self._present: dict[str, DeviceFault] = {}
+        self._seen_s: dict[str, float] = {}
 
     def set(self, condition: str, detail: str, now_s: float) -> None:
         """The condition is present (a later detail does not replace that of a latched one)."""
         former = self._present.get(condition)
+        self._seen_s[condition] = now_s
         if former is not None and condition in LATCHING:
             return
         since_s = former.since_s if former else now_s
@@ -65,9 +70,20 @@ class FaultMemory:
         else:
             self.clear(condition)
 
-    def all(self) -> tuple[DeviceFault, ...]:
-        """Everything present."""
-        return tuple(self._present.values())
+    def all(self, now_s: float, standing: frozenset[str] = frozenset()) -> tuple[DeviceFault, ...]:
+        """Everything present; a latching condition counts as latched when it was not seen for a second.
+
+        ``standing``: conditions that the actuator reports by a flag now, which are there however long ago they began.
+        """
+        return tuple(
+            replace(fault, latched=self._is_latched(fault.condition, now_s, standing))
+            for fault in self._present.values()
+        )
+
+    def _is_latched(self, condition: str, now_s: float, standing: frozenset[str]) -> bool:
+        if condition not in LATCHING or condition in standing:
+            return False
+        return now_s - self._seen_s[condition] > _SHOWN_S
 
     def names(self) -> frozenset[str]:
         """Names of everything present."""

@@ -119,9 +119,7 @@ def test_fault_is_named_in_time_ends_motion_and_goes_away(case: Case) -> None:
 def test_a_dead_controller_leaves_a_bounded_move() -> None:
     """The daemon dies in mid-move, without a word: at most speed x 0.3 s + dead zone are travelled afterwards."""
 
-    async def travel_mm(
-        loop: SimulatedLoop, profile: str, speed_percent: int, wait_s: float, target_mm: float
-    ) -> float:
+    async def travel_mm(loop: SimulatedLoop, profile: str, speed_percent: int, wait_s: float, aim_mm: float) -> float:
         axis_name = "tilt" if "md" in profile else "lift_left"
         async with Machine(loop, names=(axis_name,), speed_percent=speed_percent) as machine:
             unit = machine.units[axis_name]

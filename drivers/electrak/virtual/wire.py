@@ -51,7 +51,7 @@ class Wire:
                 item, origin = self._pending.popleft()
                 self.frames_n += 1
                 for node in tuple(self._nodes):
-                    if node is not origin:
+                    if node != origin:  # not "is": each access to a bound method makes a new object
                         node(item)
         finally:
             self._delivering = False
