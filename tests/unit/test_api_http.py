@@ -16,8 +16,9 @@ import httpx
 import pytest
 
 from graderd.api.app import make_app
+from graderd.api.listeners import SocketError, SocketInUseError
 from graderd.api.port import DaemonPort
-from graderd.api.server import SocketError, SocketInUseError, serve
+from graderd.api.server import serve
 from graderd.api.settings import ApiLimits
 from graderd.core.machine import Mode, Unmet
 from graderd.core.status import Status
@@ -203,6 +204,7 @@ async def test_a_stale_socket_is_replaced_and_a_live_one_is_not(tmp_path: Path) 
             await serve(make_app(FakeDaemon()), path)
         assert "\n" not in str(error.value)
         assert (await client.get("/v1/status")).status_code == 200
+    assert list(tmp_path.iterdir()) == []
 
 
 async def test_what_is_no_socket_of_ours_is_left_alone(tmp_path: Path) -> None:
