@@ -8,86 +8,14 @@ import os
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import httpx
 import pytest
 
 from drivers.rig.control import RigControl
-from graderd.core.status import Status
+from tests.machine import READY_S, machine, start_rig
 
 pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(240)]
-READY_S = 60.0
-
-
-@dataclass
-class Machine:
-    """A rig and a daemon attached to it, as processes of their own."""
-
-    directory: Path
-    rig: asyncio.subprocess.Process
-    daemon: asyncio.subprocess.Process
-    client: httpx.AsyncClient
-
-    async def status(self) -> Status:
-        return Status.model_validate((await self.client.get("/v1/status")).json())
-
-    async def command(self, name: str, **fields: Any) -> httpx.Response:
-        return await self.client.post("/v1/commands", json={"command": name, "client": "test", **fields})
-
-    async def until(self, reached: Callable[[Status], bool], timeout_s: float = READY_S) -> Status:
-        async with asyncio.timeout(timeout_s):
-            while True:
-                with suppress(httpx.TransportError):
-                    status = await self.status()
-                    if reached(status):
-                        return status
-                await asyncio.sleep(0.02)
-
-    async def turn(self) -> None:
-        """Arm, and let automatic operation turn the blade to the even angle; returns in the middle of the turn."""
-        await self.until(lambda s: all(r.met for r in s.readiness if r.mandatory) and s.soil.frames_per_s > 0)
-        async with RigControl(self.directory / "control.sock") as rig:
-            await rig.request("scene", zone="even")
-        assert (await self.command("arm")).status_code == 200
-        await self.until(lambda s: s.mode == "manual")
-        assert (await self.command("auto")).status_code == 200
-        await self.until(lambda s: (s.axes["rotation"].measured or 0.0) > 8.0)
-
-
-async def start_rig(directory: Path) -> asyncio.subprocess.Process:
-    (directory / "rig.json").unlink(missing_ok=True)
-    rig = await asyncio.create_subprocess_exec(sys.executable, "-m", "drivers.rig", "--dir", str(directory))
-    async with asyncio.timeout(READY_S):
-        while not (directory / "rig.json").exists():
-            assert rig.returncode is None
-            await asyncio.sleep(0.05)
-    return rig
-
-
-@asynccontextmanager
-async def machine(directory: Path) -> AsyncIterator[Machine]:
-    rig = await start_rig(directory)
-    socket_path = directory / "graderd.sock"
-    (directory / "graderd.toml").write_text(f'[api]\nsocket = "{socket_path}"\n', encoding="utf-8")
-    daemon = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "graderd", "run"),
-        *("--config", str(directory / "graderd.toml"), "--rig-dir", str(directory)),
-    )
-    transport = httpx.AsyncHTTPTransport(uds=str(socket_path))
-    async with httpx.AsyncClient(transport=transport, base_url="http://graderd", timeout=10.0) as client:
-        whole = Machine(directory, rig, daemon, client)
-        try:
-            yield whole
-        finally:
-            for process in (whole.daemon, whole.rig):
-                if process.returncode is None:
-                    process.kill()
-                await process.wait()
 
 
 async def test_the_demonstration_turns_the_blade_by_what_the_camera_sees() -> None:

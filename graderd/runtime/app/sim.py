@@ -92,7 +92,7 @@ def new_rig_directory() -> Path:
 
 
 def attach(config: Config, directory: Path) -> Config:
-    """The configuration with every wire replaced by the rig's.
+    """The configuration with every wire replaced by the rig's; a camera that plays files is left as it is.
 
     Raises:
         DeviceMissingError: no rig is ready in that directory.
@@ -104,7 +104,8 @@ def attach(config: Config, directory: Path) -> Config:
         raise DeviceMissingError(
             str(path), f"no rig is ready there ({error})", "Start one: graderd rig --dir DIR"
         ) from None
-    camera = {"source": "rig", "path": rig["camera"], **RIG_STREAMS}
+    plays_files = config.camera.source not in ("realsense", "rig")
+    camera = {} if plays_files else {"source": "rig", "path": rig["camera"], **RIG_STREAMS}
     changes = {
         "simulated": True,
         "camera": config.camera.model_copy(update=camera),
