@@ -69,7 +69,7 @@ class DepthJudge:
         self._rays = tuple(np.ascontiguousarray(rays[..., axis]).ravel() for axis in range(3))
         self._focal_px = view.lens.fx
         self._ground = GroundFit(settings.ground_offset_limit_m, settings.ground_slope_limit_deg)
-        self._finder = BladeFinder(blade)
+        self._finder = BladeFinder(view, blade)
         self._along_n = max(6, 3 * round(blade.length_m / settings.cell_m / 3))
         self._ahead_n = max(4, round(blade.reach_m / settings.cell_m))
         self._cell_s_m = blade.length_m / self._along_n
@@ -80,6 +80,9 @@ class DepthJudge:
         """Measure one depth picture (uint16, mm along the optical axis, 0 = no value)."""
         pixels, x, y, z = self._points(depth_mm)
         ground = self._ground.fit(x, y, z)
+        sunk = self._finder.sunk_m(depth_mm, angle_deg, ground)
+        if sunk > SUNK_M:
+            ground = replace(ground, offset_m=ground.offset_m - sunk)
         z = np.asarray(
             z - np.float32(ground.offset_m) - np.float32(ground.slope_x) * x - np.float32(ground.slope_y) * y
         )
@@ -91,11 +94,6 @@ class DepthJudge:
         x, y, z, d = x[near], y[near], z[near], d[near]
         s = y * cos - x * sin
         setback = self._finder.setback(z)
-        sunk = self._finder.sunk_m(s, d, z, setback)
-        if sunk > SUNK_M:
-            ground = replace(ground, offset_m=ground.offset_m - sunk)
-            z = np.asarray(z + np.float32(sunk), dtype=np.float32)
-            setback = self._finder.setback(z)
         fix = self._finder.find(s, d, z, setback)
         # Small rotation and shift of the blade against its calibrated place.
         turn = np.float32(np.radians(fix.turn_deg))

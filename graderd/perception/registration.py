@@ -11,9 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from graderd.core.blade import BladeGeometry
-from graderd.perception.geometry import F32, F64, face_setback_m
+from graderd.core.blade import BladeGeometry, blade_coordinates
+from graderd.hal.camera import DepthImage
+from graderd.perception.geometry import F32, F64, View, face_setback_m, top_edge_m
 
 GROUND_CELL_M = 0.08
 GROUND_BAND_M = 0.13
@@ -25,7 +27,10 @@ CELL_FLAT_M = 0.010
 MIN_CELL_POINTS_N = 3
 INLIER_M = 0.010
 HYPOTHESES_N = 64
-TOP_BIN_M = 0.005
+NOMINAL_WIDTH_PX = 848
+TOP_COLUMNS_N = 24
+TOP_SEARCH_PX = 36
+"""The upper edge is looked for so far above and below where it should be, at 848 pixels across."""
 SUNK_M = 0.025
 """The blade lower in the ground than this: what was taken for the ground is a layer of soil."""
 
@@ -150,36 +155,57 @@ class BladeFinder:
 
     SEARCH_M = 0.09
     COLUMNS_N = 12
-    TOP_BANDS_N = 16
 
-    def __init__(self, blade: BladeGeometry) -> None:
+    def __init__(self, view: View, blade: BladeGeometry) -> None:
+        self._view = view
         self._blade = blade
         table = np.linspace(-0.2, 0.8, 1001)
         self._setback = face_setback_m(blade, table).astype(np.float32)
 
-    def setback(self, z: F32) -> F32:
+    def setback(self, z: npt.NDArray[np.floating]) -> F32:
         """Set-back of the hollow face at heights ``z`` (table look-up, 1 mm)."""
-        index = np.clip((z + np.float32(0.2)) * np.float32(1000.0), 0, 1000).astype(np.int32)
+        index = np.clip((z + 0.2) * 1000.0, 0, 1000).astype(np.int32)
         return np.asarray(self._setback[index], dtype=np.float32)
 
-    def sunk_m(self, s: F32, d: F32, z: F32, setback: F32) -> float:
+    def sunk_m(self, depth_mm: DepthImage, angle_deg: float, ground: Ground) -> float:
         """How far the blade's upper edge lies lower than it would above this ground; 0 where it cannot be told.
 
         A level layer of soil all round looks like ground. But a blade does not stand deep in the ground: where it
-        seems to, the level was the layer's.
+        seems to, the level was the layer's. The edge is looked for down columns of the picture; one above which
+        something nearer stands is hidden, not low.
         """
-        blade = self._blade
-        half = blade.length_m / 2 - 0.03
-        take = np.flatnonzero((np.abs(d + setback) < self.SEARCH_M) & (np.abs(s) < half) & (z > 0.03))
-        band = ((s[take] + np.float32(half)) * np.float32(self.TOP_BANDS_N / (2 * half))).astype(np.int32)
-        bins = round(2 * blade.height_m / TOP_BIN_M)
-        level = np.minimum(z[take] * np.float32(1 / TOP_BIN_M), bins - 1).astype(np.int32)
-        counts = np.bincount(band * bins + level, minlength=(self.TOP_BANDS_N + 1) * bins)
-        filled = counts.reshape(-1, bins)[: self.TOP_BANDS_N] >= 2
-        known = filled.any(axis=1)
-        if known.sum() < self.TOP_BANDS_N // 2:
+        blade, lens = self._blade, self._view.lens
+        edge = self._view.project(top_edge_m(blade, angle_deg, TOP_COLUMNS_N, 0.04))
+        scale = lens.width / NOMINAL_WIDTH_PX
+        reach, step = round(TOP_SEARCH_PX * scale), max(1, round(2 * scale))
+        u, v = np.round(edge[np.isfinite(edge).all(axis=1)]).astype(np.intp).T
+        inside = (u >= 0) & (u < lens.width) & (v >= reach) & (v < lens.height - reach)
+        if inside.sum() < TOP_COLUMNS_N // 3:
             return 0.0
-        tops = (bins - np.argmax(filled[known, ::-1], axis=1)) * TOP_BIN_M
+        u = u[inside, None]
+        v = v[inside, None] + np.arange(-reach, reach + 1, step)[None, :]
+        z_optical = depth_mm[v, u] * 0.001
+        optical = np.stack(
+            ((u - lens.cx) / lens.fx * z_optical, (v - lens.cy) / lens.fy * z_optical, z_optical), axis=-1
+        )
+        at = optical @ self._view.rotation.T + self._view.position_m
+        height = at[..., 2] - ground.offset_m - ground.slope_x * at[..., 0] - ground.slope_y * at[..., 1]
+        _, d = blade_coordinates(at[..., 0], at[..., 1], angle_deg)
+        d = d - blade.x_offset_m
+        valid = z_optical > 0
+        face = valid & (np.abs(d + self.setback(height)) < self.SEARCH_M)
+        column, first = np.arange(len(u)), face.argmax(axis=1)
+        free = face.any(axis=1) & (first > 0)
+        edge_m = z_optical[column, first]
+        behind = np.zeros(len(u), dtype=np.intp)
+        for above in range(1, 7):
+            over = z_optical[column, np.maximum(first - above, 0)]
+            free &= (over == 0) | (over > edge_m - 0.08)
+            behind += over > edge_m + 0.08
+        free &= behind >= 2  # what has no depth may be nearer as well
+        if free.sum() < TOP_COLUMNS_N // 3:
+            return 0.0
+        tops = height[column[free], first[free]]
         return blade.bottom_z_m + blade.height_m - float(np.median(tops))
 
     def find(self, s: F32, d: F32, z: F32, setback: F32) -> BladeFix:
