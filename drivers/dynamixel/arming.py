@@ -6,7 +6,7 @@ import contextlib
 import math
 
 from drivers.dynamixel.calibration import Calibration
-from drivers.dynamixel.device import WATCHDOG_STEP_S, Ph54Device
+from drivers.dynamixel.device import WATCHDOG_STEP_S, WATCHDOG_TRIPPED, Ph54Device
 from graderd.hal.errors import DeviceError, DeviceRefusedError
 from graderd.hal.settings import RotatorSettings
 
@@ -17,8 +17,8 @@ _STILL_DEG_PER_S = 2.0
 
 
 def watchdog_counts(settings: RotatorSettings) -> int:
-    """Bus Watchdog register for the settings' time, never longer than asked (at least one step)."""
-    return max(1, min(127, math.floor(settings.watchdog_s / WATCHDOG_STEP_S + 1e-9)))
+    """Bus Watchdog register for the settings' time: one step less than fits in, so that the blade stands by then."""
+    return max(1, min(127, math.floor(settings.watchdog_s / WATCHDOG_STEP_S + 1e-9) - 1))
 
 
 def profile_counts(settings: RotatorSettings, calibration: Calibration, factor: float = 1.0) -> dict[str, int]:
@@ -63,9 +63,10 @@ async def _power_up(device: Ph54Device, settings: RotatorSettings, calibration: 
     if not calibration.needs_turns:
         wanted |= {"min_position_limit": low, "max_position_limit": high}
     stale = {name: value for name, value in wanted.items() if limits[name] != value}
-    if health["torque_enable"] and (stale or goals["bus_watchdog"] != 0):
+    tripped = goals["bus_watchdog"] == WATCHDOG_TRIPPED
+    if health["torque_enable"] and (stale or tripped):
         await device.torque(False)
-    if goals["bus_watchdog"] != 0:
+    if tripped:
         await device.write("bus_watchdog", 0)
     for name, value in stale.items():
         await device.write(name, value)

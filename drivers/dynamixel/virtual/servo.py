@@ -25,8 +25,8 @@ _BACKUP_KEY = bytes((0x43, 0x54, 0x52, 0x4C))
 _OVERLOAD_S = 5.0
 """Torque at its limit for so long is an overload (the time is not documented)."""
 _IN_POSITION_DEG = 0.1
-_TRIP_DECELERATION_DEG_PER_S2 = 360.0
-"""Slowest stop after a watchdog trip (the manual: "the predefined decelerating value")."""
+_TRIP_DECELERATION_DEG_PER_S2 = 3600.0
+"""Braking after a watchdog trip: as hard as the continuous torque can (the value is not documented)."""
 
 
 class VirtualServo:
@@ -144,8 +144,7 @@ class VirtualServo:
             self.tripped = True
         mode = self.memory["operating_mode"]
         if self.tripped:
-            slowing = max(self._profile().acceleration_deg_per_s2, _TRIP_DECELERATION_DEG_PER_S2)
-            self.trajectory.step_velocity(dt_s, 0.0, slowing)
+            self.trajectory.step_velocity(dt_s, 0.0, _TRIP_DECELERATION_DEG_PER_S2)
             self.plant.step_loop(dt_s, self.trajectory, self._limit_nm())
         elif mode in (POSITION_MODE, EXTENDED_MODE):
             self.trajectory.step(dt_s, self._profile(), self._top_deg_per_s())
