@@ -11,12 +11,18 @@ from drivers.rig.soil import FloatArray, SoilField
 
 PILE_LENGTH_M, PILE_WIDTH_M, PILE_HEIGHT_M = 1.0, 0.45, 0.3
 """A heap for scattering work (section 3.3 of the paper), along the travel, across, and up, as poured."""
-PILE_OFFSET_M = 0.42
+PILE_OFFSET_M = 0.45
 """Distance of a left or right heap's middle line from the bed's."""
-LAYER_HEIGHT_M = 0.06
+LAYER_HEIGHT_M = 0.04
 LAYER_HALF_WIDTH_M = 0.70
 LAYER_BEHIND_M, LAYER_AHEAD_M = 0.9, 4.5
-TOE_M = -0.08
+BARE_STRIP_M = (0.36, 0.70)
+WINDROW_HEIGHT_M = 0.12
+WINDROW_X_M, WINDROW_Y_M = (-0.50, 0.35), (0.50, 0.80)
+"""A bare strip across the layer, beyond the blade's reach, and a windrow beside its left end: with them a standing
+blade that turns from 0 to +45 degrees keeps the soil before it even. Its left end leaves the layer behind and takes in
+the windrow's foot instead; its right end, which gathers what it sweeps, finds the strip bare."""
+TOE_M = -0.10
 """Gap between the blade's face and the foot of a heap."""
 
 
@@ -62,7 +68,7 @@ def lay_scene(field: SoilField, zone: SceneZone, x_m: float, pose: BladePose, se
     if zone is SceneZone.NONE:
         return
     if zone is SceneZone.EVEN:
-        field.add(layer(field, x_m - LAYER_BEHIND_M, x_m + LAYER_AHEAD_M, LAYER_HALF_WIDTH_M, LAYER_HEIGHT_M, seed))
+        field.add(_even(field, x_m, seed))
         return
     y_m = {SceneZone.LEFT: PILE_OFFSET_M, SceneZone.CENTER: 0.0, SceneZone.RIGHT: -PILE_OFFSET_M}[zone]
     field.add(heap(field, x_m + 1.2, y_m, PILE_LENGTH_M, PILE_WIDTH_M, PILE_HEIGHT_M, seed))
@@ -71,6 +77,15 @@ def lay_scene(field: SoilField, zone: SceneZone, x_m: float, pose: BladePose, se
     field.heights_m = np.roll(field.heights_m, cells, axis=0)
     s_m, d_m = blade_grid(field, field.whole, x_m, pose.angle_deg)
     field.heights_m[(d_m < 0.02) & (np.abs(s_m) < LENGTH_M / 2.0 + 0.3)] = 0.0
+
+
+def _even(field: SoilField, x_m: float, seed: int) -> FloatArray:
+    along, across = field.x_m[:, None] - x_m, field.y_m[None, :]
+    poured = layer(field, x_m - LAYER_BEHIND_M, x_m + LAYER_AHEAD_M, LAYER_HALF_WIDTH_M, LAYER_HEIGHT_M, seed)
+    bare = (along > BARE_STRIP_M[0]) & (along < BARE_STRIP_M[1]) & (across < LAYER_HALF_WIDTH_M)
+    windrow = (along > WINDROW_X_M[0]) & (along < WINDROW_X_M[1])
+    windrow = windrow & (across > WINDROW_Y_M[0]) & (across < WINDROW_Y_M[1])
+    return np.asarray(np.where(bare, 0.0, poured) + np.where(windrow, WINDROW_HEIGHT_M, 0.0))
 
 
 def lumps(field: SoilField, seed: int, depth: float = 0.2) -> FloatArray:

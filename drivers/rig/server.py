@@ -429,7 +429,7 @@ class Rig:
             "vol_left_l": left,
             "vol_center_l": center,
             "vol_right_l": right,
-            "soil_kg": world.soil_kg,
+            "soil_mass_kg": world.soil_kg,
             "load_force_n": load.force_n,
             "load_torque_nm": load.torque_nm,
             "servo_torque_enabled": self.servo.torque_enabled,

@@ -195,22 +195,30 @@ def test_rig_a_heap_keeps_its_zone_while_the_blade_turns_to_meet_it(zone: SceneZ
         assert volumes[index] > 1.6 * sorted(volumes)[1]
 
 
-@pytest.mark.parametrize("start_deg", [0.0, -30.0])
-def test_rig_an_even_layer_stays_even_before_a_driving_blade_that_turns_to_45(start_deg: float) -> None:
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("speed_m_per_s", [0.5, 1.0])
+def test_rig_even_soil_stays_even_while_the_blade_turns_to_45_and_drives(seed: int, speed_m_per_s: float) -> None:
     field = SoilField()
-    lay_scene(field, SceneZone.EVEN, 1.2, BladePose(start_deg), seed=1)
+    lay_scene(field, SceneZone.EVEN, 1.2, BladePose(), seed)
     plough = Plough(field)
-    plough.settle(1.2, BladePose(start_deg))
-    x_m, angle_deg = 1.2, start_deg
-    for tick in range(500):
-        new_deg = min(45.0, angle_deg + (0.3 if tick > 20 else 0.0))
-        plough.move(x_m, BladePose(angle_deg), x_m + 0.005, BladePose(new_deg), 0.01)
-        x_m, angle_deg = x_m + 0.005, new_deg
+    plough.settle(1.2, BladePose())
+    x_m, angle_deg = 1.2, 0.0
+    shares = []
+    for tick in range(200):
+        new_deg = min(45.0, angle_deg + 0.3)
+        plough.move(x_m, BladePose(angle_deg), x_m, BladePose(new_deg), 0.01)
+        angle_deg = new_deg
         if tick % 25 == 24:
-            volumes = np.array(volumes_in_front_m3(field, x_m, angle_deg))
-            shares = volumes / volumes.sum()
-            assert shares.min() > 0.22
-            assert shares.max() < 0.45
+            shares.append(np.array(volumes_in_front_m3(field, x_m, angle_deg)))
+    step_m = speed_m_per_s * 0.01
+    for tick in range(round(2.0 / step_m)):
+        plough.move(x_m, BladePose(angle_deg), x_m + step_m, BladePose(angle_deg), 0.01)
+        x_m += step_m
+        if tick % 25 == 24:
+            shares.append(np.array(volumes_in_front_m3(field, x_m, angle_deg)))
+    parts = np.array([volumes / volumes.sum() for volumes in shares])
+    assert parts.min() > 0.21
+    assert parts.max() < 0.47
 
 
 def test_rig_scene_none_is_an_empty_bed() -> None:

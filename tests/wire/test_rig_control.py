@@ -103,7 +103,7 @@ async def test_rig_answers_nonsense_with_one_line_and_does_nothing(rig: tuple[Ri
     assert known["present"] == {"camera": {}, "servo": {}, "actuators": {}}
     for key in ("blade_deg", "vehicle_x_m", "speed_m_per_s", "driving", "lift_left_mm", "tilt_mm"):
         assert after[key] == before[key], key
-    assert after["soil_kg"] == pytest.approx(before["soil_kg"], rel=1e-12)
+    assert after["soil_mass_kg"] == pytest.approx(before["soil_mass_kg"], rel=1e-12)
 
 
 async def test_rig_hangs_up_on_a_line_without_end(rig: tuple[Rig, RigControl]) -> None:
@@ -132,12 +132,12 @@ async def test_rig_scene_drive_and_views(rig: tuple[Rig, RigControl], tmp_path: 
     assert sum(volumes["none"]) == 0.0
 
     await control.scene("center", seed=5)
-    mass_kg = (await control.state())["soil_kg"]
+    mass_kg = (await control.state())["soil_mass_kg"]
     answer = await control.drive(1.0, 0.5)
     assert answer["distance_m"] == pytest.approx(0.5)
     state = await state_when(control, "driving", False)
     assert state["vehicle_x_m"] == pytest.approx(1.7, abs=0.002)
-    assert state["soil_kg"] == pytest.approx(mass_kg, rel=1e-9)
+    assert state["soil_mass_kg"] == pytest.approx(mass_kg, rel=1e-9)
     assert (await control.drive(1.0, 8.0))["distance_m"] == pytest.approx(5.3, abs=0.01)  # as far as the bed goes
     await control.halt()
     state = await state_when(control, "driving", False)
@@ -166,7 +166,7 @@ async def test_rig_place_pours_more_soil_where_it_is_told(rig: tuple[Rig, RigCon
     assert first["vol_left_l"] < 0.1
     await control.request("place", x_m=0.3, y_m=0.33, length_m=0.3, width_m=0.25, height_m=0.15)
     second = await control.state()
-    assert second["soil_kg"] > first["soil_kg"] + 3.0
+    assert second["soil_mass_kg"] > first["soil_mass_kg"] + 3.0
 
 
 async def test_rig_forwards_faults_and_clears_them(rig: tuple[Rig, RigControl]) -> None:
