@@ -12,6 +12,7 @@ import sys
 from collections import Counter
 
 REQUESTS = {
+    "none": b"",
     "ask": b"GET /v1/status HTTP/1.1\r\nHost: localhost\r\n\r\n",
     "hammer": b"POST /v1/commands HTTP/1.1\r\nHost: localhost\r\nContent-Length: 3\r\n\r\n{]}",
     "stop": b"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0\r\n\r\n",
