@@ -16,12 +16,15 @@ class DeviceFault:
     ``condition``: the catalogue's name of the condition, for example ``no_reply``.
     ``detail``: one line with the numbers, for example ``no status packet for 0.21 s (7 requests)``.
     ``since_s``: monotonic time at which it was first seen.
+    ``latched``: the cause is gone, the driver keeps the condition until it is armed again. The fault catalogue has
+    latches of its own; a driver's latch must not keep the machine from the very arm that ends it.
     """
 
     device: str
     condition: str
     detail: str
     since_s: float
+    latched: bool = False
 
     @property
     def name(self) -> str:

@@ -1,7 +1,9 @@
 """Faults of the three linear actuators; axes ``own`` stands for the axis of the one that has it.
 
-An actuator that cannot be heard or is not the one configured may be anywhere: DISARM. One that is heard but cannot
-move as told holds its own axis, the other lift with it. An actuator rests unpowered on its brake.
+An actuator that cannot be heard or is not the one configured may be anywhere: DISARM. So does one that switched off
+or stuck in the middle of a move: its driver lets no motion through until it is armed again, and the blade may stand
+askew. One that is heard but may not begin a move holds its own axis, the other lift with it. An actuator rests
+unpowered on its brake.
 """
 
 from graderd.core.faults import Clear, FaultRow, Reaction
@@ -37,8 +39,8 @@ ROWS = (
         "actuator.overload",
         "an actuator has switched off because its load was too large",
         "the blade pushes against something, or the current limit is too low",
-        "free the blade, look at current_limit_a; then disarm and arm",
-        Reaction.HOLD,
+        "free the blade, look at current_limit_a; then arm",
+        Reaction.DISARM,
         clear=Clear.ON_REARM,
         axes=OWN,
     ),
@@ -106,8 +108,8 @@ ROWS = (
         "actuator.not_moving",
         "an actuator is told to move and does not",
         "it is stuck, too heavily loaded, or at an end of its stroke that the configuration does not know",
-        "free the blade, look at min_mm and max_mm; then disarm and arm",
-        Reaction.HOLD,
+        "free the blade, look at min_mm and max_mm; then arm",
+        Reaction.DISARM,
         clear=Clear.ON_REARM,
         axes=OWN,
     ),

@@ -28,7 +28,7 @@ CONFIG = """\
 [api]
 socket = "{directory}/graderd.sock"
 [can]
-stop_pgn_n = 65400
+stop_pgn_n = 64999
 [camera]
 rate_hz = 10.0
 [control]
