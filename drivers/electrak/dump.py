@@ -7,9 +7,9 @@ import json
 import re
 import select
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Any, Final, TextIO
 
 import can
 
@@ -20,7 +20,13 @@ from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError, DeviceLostError, ProtocolError
 from graderd.hal.settings import CanSettings
 
-_READERS: Final = {".asc", ".blf", ".mf4", ".trc", ".csv", ".db"}
+_READERS: Final[dict[str, tuple[Callable[[Any], Iterable[can.Message]], str]]] = {
+    ".asc": (can.ASCReader, "r"),
+    ".blf": (can.BLFReader, "rb"),
+    ".mf4": (can.MF4Reader, "rb"),
+    ".trc": (can.TRCReader, "r"),
+    ".csv": (can.CSVReader, "r"),
+}
 """Log formats read by python-can, by file name; every other file is taken for candump text."""
 
 # candump -l / -L:  (1622749162.123456) can0 18EF1300#DC05191500000000
@@ -45,10 +51,12 @@ def read_file(path: Path) -> Iterator[Timed]:
     if path.suffix.lower() not in _READERS:
         yield from _read_candump(path)
         return
+    make_reader, mode = _READERS[path.suffix.lower()]
     try:
-        for message in can.LogReader(path):
-            if not (message.is_error_frame or message.is_remote_frame):
-                yield message.timestamp, Frame(message.arbitration_id, bytes(message.data), message.is_extended_id)
+        with path.open(mode) as file:  # opened here, because some readers leave a damaged file open
+            for message in make_reader(file):
+                if not (message.is_error_frame or message.is_remote_frame):
+                    yield message.timestamp, Frame(message.arbitration_id, bytes(message.data), message.is_extended_id)
     except OSError:
         raise
     except Exception as error:  # each format's reader has its own ways to fail on a damaged file
