@@ -11,6 +11,7 @@ import http.client
 import json
 import os
 import socket
+import struct
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -109,14 +110,13 @@ class Daemon:
             CliError: no daemon, or it refused.
         """
         from websockets.exceptions import ConnectionClosed, InvalidHandshake
-        from websockets.sync.client import unix_connect
+        from websockets.sync.client import connect
 
         uri = f"ws://localhost{path}?{urlencode(query)}" if query else f"ws://localhost{path}"
         try:
+            sock = _connect(self.socket_path, TIMEOUT_S)
             # `legacy` pins what the call returns: a connection, whatever the library's default becomes.
-            connection = unix_connect(
-                str(self.socket_path), uri, compression=None, proxy=None, open_timeout=TIMEOUT_S, legacy=True
-            )
+            connection = connect(uri, sock=sock, compression=None, proxy=None, open_timeout=TIMEOUT_S, legacy=True)
         except OSError as error:
             raise self._unreachable(error) from error
         except InvalidHandshake as error:
@@ -173,7 +173,7 @@ class Daemon:
             return CliError(
                 where, "this user may not use the daemon's socket", "join its group (graderd)", ExitCode.NO_DAEMON
             )
-        if isinstance(error, TimeoutError):
+        if isinstance(error, TimeoutError | BlockingIOError):
             return CliError(where, "the daemon did not answer in time", "see its log", ExitCode.NO_DAEMON)
         return CliError(where, f"the daemon cannot be reached: {error}", "see its log", ExitCode.NO_DAEMON)
 
@@ -186,9 +186,27 @@ class _UnixConnection(http.client.HTTPConnection):
         self._path = path
 
     def connect(self) -> None:
-        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self.sock.settimeout(self.timeout)
-        self.sock.connect(str(self._path))
+        self.sock = _connect(self._path, self.timeout or TIMEOUT_S)
+
+
+def _connect(path: Path, timeout_s: float) -> socket.socket:
+    """A connection to the daemon. Where its queue is full, we wait in the kernel's line: a socket with a Python
+    timeout is told "try again" instead, and whoever tries more often gets in first.
+
+    Raises:
+        OSError: no daemon, no right, or not within ``timeout_s`` (BlockingIOError).
+    """
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        wait = struct.pack("@ll", int(timeout_s), int(timeout_s % 1 * 1e6))
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, wait)
+        connection.connect(str(path))
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", 0, 0))
+        connection.settimeout(timeout_s)
+    except OSError:
+        connection.close()
+        raise
+    return connection
 
 
 def _worth_retrying(error: Exception, path: str) -> bool:
