@@ -22,7 +22,7 @@ RENEW_S = 0.1
 REPLY_S = 2.0
 SETTLED_S = 0.3
 TOLERANCE = {"deg": 0.6, "mm": 2.5}
-VALUE = re.compile(r"(?P<absolute>=)?(?P<sign>[+-])?(?P<number>\d+(\.\d*)?|\.\d+)\s*(?P<unit>[^\d\s.]*)")
+VALUE = re.compile(r"(?P<absolute>=)?(?P<sign>[+-])?(?P<number>\d{1,6}(\.\d{0,9})?|\.\d{1,9})\s*(?P<unit>[^\d\s.]*)")
 
 
 class Axis(StrEnum):

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import signal
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from graderd.api.settings import ApiLimits
 from graderd.cli.console import CliError
-from graderd.cli.jog import JogValue, parse_value
+from graderd.cli.jog import UNITS, VALUE, JogValue, parse_value
 from graderd.core.machine import Mode
 from tests.unit.api_daemon import FakeDaemon, serving, within
 from tests.unit.test_cli_modes import Capture, cli, command_line
@@ -48,6 +51,7 @@ def test_values(axis: str, text: str, expected: JogValue) -> None:
         ("rotate", "--5deg", "is no value"),
         ("rotate", "1e3deg", "is no value"),
         ("rotate", "5 5deg", "is no value"),
+        ("rotate", "9" * 400 + "deg", "is no value"),
     ],
 )
 def test_what_is_no_value(axis: str, text: str, says: str) -> None:
@@ -55,6 +59,16 @@ def test_what_is_no_value(axis: str, text: str, says: str) -> None:
         parse_value(axis, text)
     assert says in error.value.cause
     assert error.value.exit_code == 2
+
+
+@given(st.sampled_from(list(UNITS)), st.text(max_size=20) | st.from_regex(VALUE))
+def test_whatever_is_typed_is_a_finite_value_or_bad_usage(axis: str, text: str) -> None:
+    value: float | None
+    try:
+        value = parse_value(axis, text).value
+    except CliError as error:
+        value = None if error.exit_code == 2 else math.nan
+    assert value is None or math.isfinite(value)
 
 
 @pytest.mark.parametrize(
