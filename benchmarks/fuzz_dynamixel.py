@@ -6,7 +6,7 @@ escape, and replies accepted although the string is not the original.
 
 What the checksum is sure to find (a burst of up to 16 bits before it, up to three flipped bits anywhere, cut ends) must
 never be accepted. Other damage (random bytes, bytes inserted or removed, several bursts) is a valid packet once in
-65,536 candidates by arithmetic; a burst into the checksum, whose bytes travel in the other order, some times more often.
+65,536 candidates by arithmetic, a burst into the checksum (whose bytes travel in the other order) somewhat more often.
 Such a packet is valid for every implementation of the protocol; how often it happened is printed.
 """
 
