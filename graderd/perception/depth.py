@@ -66,7 +66,7 @@ class DepthJudge:
         # The stride is meant for a picture 848 pixels across; a smaller one is sampled as densely on the ground.
         self._stride = max(1, round(settings.stride_px * view.lens.width / NOMINAL_WIDTH_PX))
         rays = view.rays(self._stride)
-        self._rays = tuple(np.ascontiguousarray(rays[..., axis]).ravel() for axis in range(3))
+        self._rays = np.ascontiguousarray(rays.reshape(-1, 3).T)
         self._focal_px = view.lens.fx
         self._ground = GroundFit(settings.ground_offset_limit_m, settings.ground_slope_limit_deg)
         self._finder = BladeFinder(view, blade)
@@ -78,21 +78,15 @@ class DepthJudge:
 
     def height_map(self, depth_mm: DepthImage, angle_deg: float) -> HeightMap:
         """Measure one depth picture (uint16, mm along the optical axis, 0 = no value)."""
-        pixels, x, y, z = self._points(depth_mm)
-        ground = self._ground.fit(x, y, z)
+        pixels, points = self._points(depth_mm)
+        ground = self._ground.fit(*points)
         sunk = self._finder.sunk_m(depth_mm, angle_deg, ground)
         if sunk > SUNK_M:
             ground = replace(ground, offset_m=ground.offset_m - sunk)
-        z = np.asarray(
-            z - np.float32(ground.offset_m) - np.float32(ground.slope_x) * x - np.float32(ground.slope_y) * y
-        )
-        angle = np.radians(angle_deg)
-        cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-        d = x * cos + y * sin - np.float32(self._blade.x_offset_m)
+        s, d, z = self._in_blade(points, ground, angle_deg)
         near = np.flatnonzero((d > -0.20) & (d < self._blade.reach_m + CONTEXT_M) & (z < self._settings.max_height_m))
         valid = self._valid_shares(pixels[near], angle_deg)
-        x, y, z, d = x[near], y[near], z[near], d[near]
-        s = y * cos - x * sin
+        s, d, z = s[near], d[near], z[near]
         setback = self._finder.setback(z)
         fix = self._finder.find(s, d, z, setback)
         # Small rotation and shift of the blade against its calibrated place.
@@ -113,14 +107,24 @@ class DepthJudge:
             )
         return verdict
 
-    def _points(self, depth_mm: DepthImage) -> tuple[I64, F32, F32, F32]:
-        """Indices of the sampled pixels that have depth, and their points in the vehicle frame."""
+    def _points(self, depth_mm: DepthImage) -> tuple[I64, F32]:
+        """Indices of the sampled pixels that have depth, and their points in the vehicle frame (3 x N)."""
         stride = self._stride
         depth = depth_mm[stride // 2 :: stride, stride // 2 :: stride].ravel()
         valid = np.flatnonzero(depth)
-        range_m = depth[valid].astype(np.float32) * np.float32(0.001)
-        x, y, z = (ray[valid] * range_m + origin for ray, origin in zip(self._rays, self._position, strict=True))
-        return valid, x, y, z
+        points = np.take(self._rays, valid, axis=1)
+        points *= depth[valid] * np.float32(0.001)
+        points += self._position[:, None]
+        return valid, points
+
+    def _in_blade(self, points: F32, ground: Ground, angle_deg: float) -> tuple[F32, F32, F32]:
+        """Points in blade coordinates s and d, and their heights above the ground: one product for all three."""
+        angle = np.radians(angle_deg)
+        cos, sin = np.cos(angle), np.sin(angle)
+        turn = np.array(((-sin, cos, 0), (cos, sin, 0), (-ground.slope_x, -ground.slope_y, 1)), dtype=np.float32)
+        shift = np.array((0, -self._blade.x_offset_m, -ground.offset_m), dtype=np.float32)
+        s, d, z = np.asarray(turn @ points + shift[:, None], dtype=np.float32)
+        return s, d, z
 
     def _valid_shares(self, pixels: I64, angle_deg: float) -> tuple[float, float, float]:
         """Of the pixels on each third, the share among ``pixels``."""

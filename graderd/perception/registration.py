@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from graderd.core.blade import BladeGeometry, blade_coordinates
+from graderd.core.blade import BladeGeometry
 from graderd.hal.camera import DepthImage
 from graderd.perception.geometry import F32, F64, View, face_setback_m, top_edge_m
 
@@ -27,8 +27,12 @@ CELL_FLAT_M = 0.010
 MIN_CELL_POINTS_N = 3
 INLIER_M = 0.010
 HYPOTHESES_N = 64
+VOTERS_N = 100
 NOMINAL_WIDTH_PX = 848
+FACE_POINTS_N = 2000
 TOP_COLUMNS_N = 24
+EDGE_ANGLE_STEP_DEG = 0.5
+KEPT_COLUMNS_N = 256
 TOP_SEARCH_PX = 36
 """The upper edge is looked for so far above and below where it should be, at 848 pixels across."""
 SUNK_M = 0.025
@@ -77,7 +81,8 @@ class GroundFit:
         if cx.size < 6:
             return Ground()
         a = np.column_stack((np.ones_like(cx), cx, cy))
-        plane = self._vote(a, cz)
+        few = max(1, cx.size // VOTERS_N)
+        plane = self._vote(a[::few], cz[::few])
         for width in (2.0 * INLIER_M, INLIER_M):
             near = np.abs(cz - a @ plane) < width
             if near.sum() < 6:
@@ -113,13 +118,14 @@ class GroundFit:
     def _vote(self, a: F64, z: F64) -> F64:
         count = z.size
         picks = np.minimum((self._draws * count).astype(np.intp), count - 1)
-        with np.errstate(all="ignore"):
-            p0, p1, p2 = (np.column_stack((a[picks[:, i], 1:], z[picks[:, i]])) for i in range(3))
-            normal = np.cross(p1 - p0, p2 - p0)
-            good = np.abs(normal[:, 2]) > 0.01
-            up = np.where(good, normal[:, 2], 1.0)
-            slope_x, slope_y = -normal[:, 0] / up, -normal[:, 1] / up
-            offset = p0[:, 2] - slope_x * p0[:, 0] - slope_y * p0[:, 1]
+        x, y, height = a[:, 1][picks], a[:, 2][picks], z[picks]
+        dx, dy, dz = x[:, 1:] - x[:, :1], y[:, 1:] - y[:, :1], height[:, 1:] - height[:, :1]
+        area = dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]
+        good = np.abs(area) > 0.01
+        area = np.where(good, area, 1.0)
+        slope_x = (dz[:, 0] * dy[:, 1] - dz[:, 1] * dy[:, 0]) / area
+        slope_y = (dx[:, 0] * dz[:, 1] - dx[:, 1] * dz[:, 0]) / area
+        offset = height[:, 0] - slope_x * x[:, 0] - slope_y * y[:, 0]
         good &= np.hypot(slope_x, slope_y) < 1.5 * self._slope_limit
         good &= np.abs(offset) < 1.5 * self._offset_limit_m
         planes = np.vstack((np.zeros((1, 3)), np.column_stack((offset, slope_x, slope_y))[good]))
@@ -150,6 +156,14 @@ class BladeFix:
     missing: float = 0.0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _EdgeColumns:
+    """Pieces of picture columns across the blade's upper edge: flat pixel indices and their rays, columns x pixels."""
+
+    pixels: npt.NDArray[np.intp]
+    rays: F32
+
+
 class BladeFinder:
     """Finds the moldboard's face and ends in the points, given roughly where they are."""
 
@@ -158,6 +172,9 @@ class BladeFinder:
 
     def __init__(self, view: View, blade: BladeGeometry) -> None:
         self._view = view
+        self._all_rays = view.rays()
+        self._position = view.position_m.astype(np.float32)
+        self._columns: dict[int, _EdgeColumns | None] = {}
         self._blade = blade
         table = np.linspace(-0.2, 0.8, 1001)
         self._setback = face_setback_m(blade, table).astype(np.float32)
@@ -174,30 +191,21 @@ class BladeFinder:
         seems to, the level was the layer's. The edge is looked for down columns of the picture; one above which
         something nearer stands is hidden, not low.
         """
-        blade, lens = self._blade, self._view.lens
-        edge = self._view.project(top_edge_m(blade, angle_deg, TOP_COLUMNS_N, 0.04))
-        scale = lens.width / NOMINAL_WIDTH_PX
-        reach, step = round(TOP_SEARCH_PX * scale), max(1, round(2 * scale))
-        u, v = np.round(edge[np.isfinite(edge).all(axis=1)]).astype(np.intp).T
-        inside = (u >= 0) & (u < lens.width) & (v >= reach) & (v < lens.height - reach)
-        if inside.sum() < TOP_COLUMNS_N // 3:
+        columns = self._edge_columns(round(angle_deg / EDGE_ANGLE_STEP_DEG))
+        if columns is None:
             return 0.0
-        u = u[inside, None]
-        v = v[inside, None] + np.arange(-reach, reach + 1, step)[None, :]
-        z_optical = depth_mm[v, u] * 0.001
-        optical = np.stack(
-            ((u - lens.cx) / lens.fx * z_optical, (v - lens.cy) / lens.fy * z_optical, z_optical), axis=-1
-        )
-        at = optical @ self._view.rotation.T + self._view.position_m
+        blade = self._blade
+        z_optical = depth_mm.ravel()[columns.pixels] * np.float32(0.001)
+        at = columns.rays * z_optical[..., None] + self._position
         height = at[..., 2] - ground.offset_m - ground.slope_x * at[..., 0] - ground.slope_y * at[..., 1]
-        _, d = blade_coordinates(at[..., 0], at[..., 1], angle_deg)
-        d = d - blade.x_offset_m
+        cos, sin = np.float32(np.cos(np.radians(angle_deg))), np.float32(np.sin(np.radians(angle_deg)))
+        d = at[..., 0] * cos + at[..., 1] * sin - np.float32(blade.x_offset_m)
         valid = z_optical > 0
         face = valid & (np.abs(d + self.setback(height)) < self.SEARCH_M)
-        column, first = np.arange(len(u)), face.argmax(axis=1)
+        column, first = np.arange(len(z_optical)), face.argmax(axis=1)
         free = face.any(axis=1) & (first > 0)
         edge_m = z_optical[column, first]
-        behind = np.zeros(len(u), dtype=np.intp)
+        behind = np.zeros(len(z_optical), dtype=np.intp)
         for above in range(1, 7):
             over = z_optical[column, np.maximum(first - above, 0)]
             free &= (over == 0) | (over > edge_m - 0.08)
@@ -207,6 +215,28 @@ class BladeFinder:
             return 0.0
         tops = height[column[free], first[free]]
         return blade.bottom_z_m + blade.height_m - float(np.median(tops))
+
+    def _edge_columns(self, step: int) -> _EdgeColumns | None:
+        """The pixels in which the upper edge is looked for at this angle; None where too few are in the picture."""
+        if step in self._columns:
+            return self._columns[step]
+        lens = self._view.lens
+        angle_deg = step * EDGE_ANGLE_STEP_DEG
+        edge = self._view.project(top_edge_m(self._blade, angle_deg, TOP_COLUMNS_N, 0.04))
+        scale = lens.width / NOMINAL_WIDTH_PX
+        reach, stride = round(TOP_SEARCH_PX * scale), max(1, round(2 * scale))
+        u, v = np.round(edge[np.isfinite(edge).all(axis=1)]).astype(np.intp).T
+        inside = (u >= 0) & (u < lens.width) & (v >= reach) & (v < lens.height - reach)
+        columns: _EdgeColumns | None = None
+        if inside.sum() >= TOP_COLUMNS_N // 3:
+            down = np.arange(-reach, reach + 1, stride)
+            v = v[inside, None] + down[None, :]
+            u = np.broadcast_to(u[inside, None], v.shape)
+            columns = _EdgeColumns(v * lens.width + u, self._all_rays[v, u])
+        if len(self._columns) >= KEPT_COLUMNS_N:
+            self._columns.clear()
+        self._columns[step] = columns
+        return columns
 
     def find(self, s: F32, d: F32, z: F32, setback: F32) -> BladeFix:
         """``s, d, z``: points in blade coordinates, level ground at z = 0; ``setback`` that of their heights."""
@@ -218,6 +248,7 @@ class BladeFinder:
         near = np.flatnonzero(upper & (np.abs(face) < self.SEARCH_M))
         if near.size < 40:
             return BladeFix()
+        near = near[:: max(1, near.size // FACE_POINTS_N)]
         near_s, near_face = s[near], face[near]
         column = ((near_s + np.float32(half)) * np.float32(self.COLUMNS_N / blade.length_m)).astype(np.int32)
         at, medians = [], []
