@@ -29,7 +29,9 @@ def register(app: typer.Typer) -> None:
         """
         from graderd.runtime.app import run_guard
 
-        logging.basicConfig(level=logging.INFO, format="%(message)s")
+        log = logging.getLogger("graderd")
+        log.addHandler(logging.StreamHandler())
+        log.setLevel(logging.INFO)
         status = run_guard(config)
         if json:
             print_json({"safe": status == 0})

@@ -22,6 +22,7 @@ from graderd.cli.console import (
 )
 from graderd.cli.epilog import example
 
+THERMAL_SHOWN = 0.05
 Section = tuple[str, Row, list[Row]]
 
 
@@ -122,7 +123,7 @@ def _axis(axis: dict[str, Any]) -> Row:
     notes = [axis["limited_because"], *axis["flags"]]
     if axis["moving"]:
         notes.append("moving")
-    if axis["thermal_load"]:
+    if (axis["thermal_load"] or 0.0) >= THERMAL_SHOWN:
         notes.append(f"thermal load {axis['thermal_load']:.0%}")
     return (
         axis["name"],

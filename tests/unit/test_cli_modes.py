@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import json
+import os
+import pty
+import signal
+import struct
+import sys
+import termios
 from pathlib import Path
 from typing import Any
 
@@ -91,9 +98,40 @@ async def test_watch_prints_one_object_a_line(tmp_path: Path) -> None:
         await process.wait()
 
 
-def command_line(path: Path, *arguments: str) -> list[str]:
-    import sys
+async def test_watch_on_a_terminal_redraws_until_ctrl_c(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (_, path):
+        ours, theirs = pty.openpty()
+        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 50, 150, 0, 0))
+        process = await asyncio.create_subprocess_exec(
+            *command_line(path, "status", "--watch"),
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            env={**os.environ, "TERM": "xterm"},
+        )
+        os.close(theirs)
+        shown, drawn_twice = bytearray(), asyncio.Event()
 
+        def read() -> None:
+            try:
+                shown.extend(os.read(ours, 65536))
+            except OSError:  # the terminal's other end is closed
+                asyncio.get_running_loop().remove_reader(ours)
+            if shown.count(b"started disarmed") >= 2:
+                drawn_twice.set()
+
+        asyncio.get_running_loop().add_reader(ours, read)
+        try:
+            await within(30, drawn_twice.wait())
+            process.send_signal(signal.SIGINT)
+            assert await within(10, process.wait()) == 0
+        finally:
+            asyncio.get_running_loop().remove_reader(ours)
+            os.close(ours)
+        assert b"Traceback" not in shown
+
+
+def command_line(path: Path, *arguments: str) -> list[str]:
     return [sys.executable, "-m", "graderd.cli", "--socket", str(path), *arguments]
 
 
