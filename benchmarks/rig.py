@@ -19,9 +19,11 @@ import numpy as np
 
 from drivers.rig.blade import BladePose
 from drivers.rig.dataset import export
+from drivers.rig.ground import SceneState
 from drivers.rig.look import Look
+from drivers.rig.materials import Materials
 from drivers.rig.piles import SceneZone
-from drivers.rig.renderer import Materials, Renderer, SceneState
+from drivers.rig.renderer import Renderer
 from drivers.rig.world import World, scene_heights
 
 BAR_FPS = 15.0

@@ -29,9 +29,11 @@ import cv2
 import numpy as np
 
 from drivers.rig.camera_faults import spoil
+from drivers.rig.ground import SceneState
 from drivers.rig.look import Look
+from drivers.rig.materials import Materials
 from drivers.rig.optics import COLOR_POSE, DEPTH_POSE, knocked
-from drivers.rig.renderer import Materials, Renderer, SceneState
+from drivers.rig.renderer import Renderer
 from drivers.rig.shared import SharedScene
 from graderd.hal.camera import ColorImage, DepthImage, Intrinsics
 

@@ -18,8 +18,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from drivers.rig.ground import SceneState
+from drivers.rig.materials import Materials
 from drivers.rig.optics import COLOR_INTRINSICS, DEPTH_INTRINSICS, camera_json, knocked
-from drivers.rig.renderer import Materials, Renderer, SceneState
+from drivers.rig.renderer import Renderer
 from drivers.rig.scenes import RandomScene, random_scene
 
 COLUMNS = ("id", "label", "blade_angle_deg", "vol_left_l", "vol_center_l", "vol_right_l")

@@ -67,6 +67,12 @@ class SharedScene:
         self._sequence += 2
         _SEQUENCE.pack_into(self._memory, 0, self._sequence)
 
+    def close(self) -> None:
+        """Let go of the memory; idempotent."""
+        if self.descriptor >= 0:
+            os.close(self.descriptor)
+            self.descriptor = -1
+
     def read(self) -> Snapshot:
         """The newest complete state; waits microseconds where the writer is just at it."""
         while True:

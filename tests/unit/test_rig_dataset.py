@@ -15,8 +15,10 @@ import pytest
 
 from drivers.rig import dataset
 from drivers.rig.blade import volumes_in_front_m3
+from drivers.rig.ground import SceneState
+from drivers.rig.materials import Materials
 from drivers.rig.optics import COLOR_POSE, DEPTH_INTRINSICS, knocked
-from drivers.rig.renderer import Materials, Renderer, SceneState
+from drivers.rig.renderer import Renderer
 from drivers.rig.scenes import label_of, random_scene
 from graderd.perception.frame_set import FrameSet
 

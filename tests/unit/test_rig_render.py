@@ -9,7 +9,9 @@ import numpy.typing as npt
 import pytest
 
 from drivers.rig.blade import BladePose, Plough
+from drivers.rig.ground import SceneState
 from drivers.rig.look import Look
+from drivers.rig.materials import Materials
 from drivers.rig.optics import (
     COLOR_INTRINSICS,
     COLOR_POSE,
@@ -21,7 +23,7 @@ from drivers.rig.optics import (
     knocked,
 )
 from drivers.rig.piles import SceneZone, lay_scene
-from drivers.rig.renderer import Materials, Renderer, SceneState
+from drivers.rig.renderer import Renderer
 from drivers.rig.shapes import Solid
 from drivers.rig.soil import SoilField
 from drivers.rig.surface import Rays, SurfaceSweep

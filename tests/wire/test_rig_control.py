@@ -180,27 +180,31 @@ async def test_rig_forwards_faults_and_clears_them(rig: tuple[Rig, RigControl]) 
     await control.request("actuator_fault", name="unplug")
     assert not machine.paths.can.is_symlink()
     await control.request("actuator_fault", name="stuck", device="lift_right")
-    assert [unit.faults.stuck for unit in (machine.lift_left, machine.lift_right)] == [False, True]
+    assert [unit.faults.stuck for unit in (machine.machine.lift_left, machine.machine.lift_right)] == [False, True]
     await control.request("servo_fault", name="push", params={"torque_nm": 33.0})
     await asyncio.sleep(0.05)
-    assert machine.servo.load_torque_nm == 33.0  # the soil's load does not overwrite the fault
+    assert machine.machine.servo.load_torque_nm == 33.0  # the soil's load does not overwrite the fault
     await control.request("clear_faults")
     await asyncio.sleep(0.05)
     assert machine.paths.servo.is_symlink()
     assert machine.paths.can.is_symlink()
-    assert [unit.faults.stuck for unit in (machine.lift_left, machine.lift_right)] == [False, False]
-    assert machine.servo.load_torque_nm == 0.0
+    assert [unit.faults.stuck for unit in (machine.machine.lift_left, machine.machine.lift_right)] == [False, False]
+    assert machine.machine.servo.load_torque_nm == 0.0
 
 
 async def test_rig_lifts_carry_the_blade_and_feel_its_weight(rig: tuple[Rig, RigControl]) -> None:
     machine, control = rig
-    machine.lift_left.position_mm, machine.lift_right.position_mm, machine.tilt.position_mm = 160.0, 140.0, 60.0
+    machine.machine.lift_left.position_mm, machine.machine.lift_right.position_mm, machine.machine.tilt.position_mm = (
+        160.0,
+        140.0,
+        60.0,
+    )
     await asyncio.sleep(0.05)
     state = await control.state()
     assert state["blade_height_mm"] == pytest.approx(50.0)
     assert state["blade_slope_deg"] == pytest.approx(1.43, abs=0.01)
     assert state["blade_pitch_deg"] == pytest.approx(3.0)
-    assert machine.lift_left.load_n == pytest.approx(150.0)
+    assert machine.machine.lift_left.load_n == pytest.approx(150.0)
 
 
 async def test_rig_light_changes_what_is_named_and_keeps_the_rest(rig: tuple[Rig, RigControl]) -> None:
