@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.dynamixel.arming import watchdog_counts
@@ -91,18 +91,18 @@ def test_one_odd_sample_raises_nothing() -> None:
 
 
 def test_near_limits_have_hysteresis_and_clear() -> None:
-    settings, flickers = MotionDetectors(SETTINGS), 0
+    detectors, flickers = MotionDetectors(SETTINGS), 0
     before = False
     for i in range(200):
         volts = 20.0 + (0.1 if i % 2 else -0.1)
-        now = "voltage_near_limit" in settings.look(Sample(i * 0.02, 0.0, 0.0, 0.0, volts, 30.0, None))
+        now = "voltage_near_limit" in detectors.look(Sample(i * 0.02, 0.0, 0.0, 0.0, volts, 30.0, None))
         flickers += now != before
         before = now
     assert flickers == 1
-    assert settings.look(Sample(5.0, 0.0, 0.0, 0.0, 24.0, 30.0, None)) == {}
-    assert "temperature_near_limit" in settings.look(Sample(5.1, 0.0, 0.0, 0.0, 24.0, 70.0, None))
-    assert "temperature_near_limit" in settings.look(Sample(5.2, 0.0, 0.0, 0.0, 24.0, 69.0, None))
-    assert settings.look(Sample(5.3, 0.0, 0.0, 0.0, 24.0, 67.0, None)) == {}
+    assert detectors.look(Sample(5.0, 0.0, 0.0, 0.0, 24.0, 30.0, None)) == {}
+    assert "temperature_near_limit" in detectors.look(Sample(5.1, 0.0, 0.0, 0.0, 24.0, 70.0, None))
+    assert "temperature_near_limit" in detectors.look(Sample(5.2, 0.0, 0.0, 0.0, 24.0, 69.0, None))
+    assert detectors.look(Sample(5.3, 0.0, 0.0, 0.0, 24.0, 67.0, None)) == {}
 
 
 # -- calibration ------------------------------------------------------------------------------------------------
@@ -116,20 +116,20 @@ _settings = st.builds(
 
 
 @given(_settings, st.floats(-60, 60))
-def test_angles_survive_the_way_to_counts_and_back(settings: RotatorSettings, angle_deg: float) -> None:
-    cal = Calibration.of(settings, TABLE)
-    count_deg = 360.0 / TABLE.profile["motion"]["pulses_per_turn"] / settings.gear_ratio
+def test_angles_survive_the_way_to_counts_and_back(made: RotatorSettings, angle_deg: float) -> None:
+    cal = Calibration.of(made, TABLE)
+    count_deg = 360.0 / TABLE.profile["motion"]["pulses_per_turn"] / made.gear_ratio
     assert cal.blade_deg(cal.counts(angle_deg)) == pytest.approx(angle_deg, abs=count_deg)
 
 
 @given(_settings)
-def test_the_servos_limits_lie_just_outside_the_soft_ones_whichever_way_it_turns(settings: RotatorSettings) -> None:
-    cal = Calibration.of(settings, TABLE)
+def test_the_servos_limits_lie_just_outside_the_soft_ones_whichever_way_it_turns(made: RotatorSettings) -> None:
+    cal = Calibration.of(made, TABLE)
     low, high = cal.servo_limits()
     assert low < high
-    for angle_deg in (settings.min_deg, settings.max_deg, 0.0):
+    for angle_deg in (made.min_deg, made.max_deg, 0.0):
         assert low < cal.counts(angle_deg) < high
-    assert not low <= cal.counts(settings.max_deg + 1.5) <= high
+    assert not low <= cal.counts(made.max_deg + 1.5) <= high
 
 
 def test_the_documented_example_and_signs() -> None:
@@ -173,6 +173,7 @@ def test_faults_hold_until_cleared_and_events_fade() -> None:
 # -- trajectory of the virtual servo --------------------------------------------------------------------------------
 
 
+@settings(max_examples=30)
 @given(st.lists(st.floats(-200, 200), min_size=1, max_size=4), st.floats(1, 90), st.floats(5, 400))
 def test_a_trajectory_keeps_its_profile_and_arrives_wherever_it_is_sent(
     goals: list[float], velocity: float, acceleration: float
