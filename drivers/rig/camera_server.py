@@ -178,6 +178,7 @@ class CameraProcess:
     def _send_frame(self, client: socket.socket, session: _Session, after: int) -> None:
         while True:
             if "stall" in self._faults:
+                _check_connected(client)
                 time.sleep(_POLL_S)
                 continue
             now_s = time.monotonic()
@@ -254,6 +255,17 @@ class _Session:
         self.last_number = -1
         self.last_picture: tuple[ColorImage, DepthImage | None] | None = None
         self.depths: list[tuple[int, DepthImage | None]] = []
+
+
+def _check_connected(client: socket.socket) -> None:
+    """Notice a client that hung up while it was kept waiting.
+
+    Raises:
+        ConnectionError: it did.
+    """
+    with contextlib.suppress(BlockingIOError):
+        if not client.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT):
+            raise ConnectionResetError("the client hung up")
 
 
 def _intrinsics(lens: Intrinsics) -> list[float]:

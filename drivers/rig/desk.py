@@ -67,8 +67,8 @@ class Desk:
                 if answer.get("quitting"):
                     self._quit()
                     break
-        except ConnectionError:
-            pass
+        except (ConnectionError, asyncio.CancelledError):
+            pass  # gone, or the rig ends: asyncio's own callback would print a cancelled client as an error
         finally:
             self._clients.discard(task)
             writer.close()

@@ -71,10 +71,9 @@ def lay_scene(field: SoilField, zone: SceneZone, x_m: float, pose: BladePose, se
         field.add(_even(field, x_m, seed))
         return
     y_m = {SceneZone.LEFT: PILE_OFFSET_M, SceneZone.CENTER: 0.0, SceneZone.RIGHT: -PILE_OFFSET_M}[zone]
-    field.add(heap(field, x_m + 1.2, y_m, PILE_LENGTH_M, PILE_WIDTH_M, PILE_HEIGHT_M, seed))
+    field.add(heap(field, field.length_m / 2.0, y_m, PILE_LENGTH_M, PILE_WIDTH_M, PILE_HEIGHT_M, seed))
     foot_m = float(field.x_m[field.heights_m.max(axis=1) > 0.004].min())
-    cells = round((x_m + TOE_M - foot_m) / field.cell_m)
-    field.heights_m = np.roll(field.heights_m, cells, axis=0)
+    _shift_along(field, round((x_m + TOE_M - foot_m) / field.cell_m))
     s_m, d_m = blade_grid(field, field.whole, x_m, pose.angle_deg)
     field.heights_m[(d_m < 0.02) & (np.abs(s_m) < LENGTH_M / 2.0 + 0.3)] = 0.0
 
@@ -86,6 +85,16 @@ def _even(field: SoilField, x_m: float, seed: int) -> FloatArray:
     windrow = (along > WINDROW_X_M[0]) & (along < WINDROW_X_M[1])
     windrow = windrow & (across > WINDROW_Y_M[0]) & (across < WINDROW_Y_M[1])
     return np.asarray(np.where(bare, 0.0, poured) + np.where(windrow, WINDROW_HEIGHT_M, 0.0))
+
+
+def _shift_along(field: SoilField, cells: int) -> None:
+    """Move all soil along the bed; what would lie beyond an end is left out."""
+    shifted = np.zeros_like(field.heights_m)
+    if cells >= 0:
+        shifted[cells:] = field.heights_m[: shifted.shape[0] - cells]
+    else:
+        shifted[:cells] = field.heights_m[-cells:]
+    field.heights_m[:] = shifted
 
 
 def lumps(field: SoilField, seed: int, depth: float = 0.2) -> FloatArray:

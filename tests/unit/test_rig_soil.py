@@ -221,6 +221,16 @@ def test_rig_even_soil_stays_even_while_the_blade_turns_to_45_and_drives(seed: i
     assert parts.max() < 0.47
 
 
+def test_rig_the_same_heap_is_laid_wherever_the_machine_stands() -> None:
+    heaps = []
+    for x_m in (0.8, 1.2, 4.0, 7.0):
+        field = SoilField()
+        lay_scene(field, SceneZone.RIGHT, x_m, BladePose(), seed=8)
+        heaps.append(volumes_in_front_m3(field, x_m, 0.0)[2])
+    assert heaps == pytest.approx([heaps[0]] * 4, rel=0.1)  # a row of cells more or less, by rounding
+    assert heaps[0] > 8e-3
+
+
 def test_rig_scene_none_is_an_empty_bed() -> None:
     field = SoilField()
     field.add(heap(field, 3.0, 0.0, 1.0, 0.5, 0.3))
