@@ -259,9 +259,12 @@ class Rig:
             "--gid=graderd",
             f"--property=RuntimeDirectory={RIG_DIRECTORY.name}",
             "--property=RuntimeDirectoryPreserve=yes",
-            # It plays hardware, which does not wait for the processor.
-            "--property=CPUWeight=10000",
-            "--property=Nice=-5",
+            # It plays hardware, which does not wait for the processor; its pictures may.
+            "--property=CPUSchedulingPolicy=rr",
+            "--property=CPUSchedulingPriority=40",
+            "--property=CPUSchedulingResetOnFork=yes",
+            "--setenv=MALLOC_TRIM_THRESHOLD_=1000000000",
+            "--setenv=MALLOC_MMAP_THRESHOLD_=1000000000",
             # At shutdown the hardware is still there when the service ends.
             "--property=Before=graderd.service",
             *(PYTHON, "-I", "-m", "drivers.rig", f"--dir={RIG_DIRECTORY}", f"--can=socketcan:{self._can}"),

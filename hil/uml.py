@@ -147,8 +147,15 @@ def _guest_process(command: Sequence[str], output_fd: int, scratch: str) -> Iter
     environment = {**os.environ, "TMPDIR": "/dev/shm" if os.access("/dev/shm", os.W_OK) else scratch, "HOME": scratch}
     # The kernel keeps a descriptor for each file of the host the guest has looked at.
     resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
+    # A guest that waits for the host's processor misses deadlines that a machine would meet.
+    preferred = ["nice", "-n", "-10"] if os.geteuid() == 0 else []
     process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=output_fd, stderr=output_fd, env=environment, start_new_session=True
+        [*preferred, *command],
+        stdin=subprocess.DEVNULL,
+        stdout=output_fd,
+        stderr=output_fd,
+        env=environment,
+        start_new_session=True,
     )
     try:
         yield process
