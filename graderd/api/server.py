@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
+import h11
 import uvicorn
 from fastapi import FastAPI
 from starlette.types import ASGIApp
@@ -20,6 +21,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from graderd.api.guard import TcpGuard, load_or_make_token
 from graderd.api.limiter import Pace
 from graderd.api.listeners import tcp_socket, unix_socket
+from graderd.api.problem import Problem
 from graderd.api.settings import ApiLimits, TcpSettings
 
 ACCEPT_BURST_N = 20
@@ -81,7 +83,8 @@ def _config(app: ASGIApp, limits: ApiLimits) -> uvicorn.Config:
         ws_per_message_deflate=False,
         lifespan="off",
         log_config=None,
-        log_level="warning",
+        # Below that uvicorn writes a line for every malformed request: a flood of those would fill the log.
+        log_level="error",
         access_log=False,
         server_header=False,
         date_header=False,
@@ -165,6 +168,16 @@ def _bounded_http(limits: ApiLimits) -> type[H11Protocol]:
         def connection_lost(self, exc: Exception | None) -> None:
             open_connections.pop(self, None)
             super().connection_lost(exc)
+
+        def send_400_response(self, msg: str) -> None:
+            """What is no HTTP is answered in the same form as everything else, as far as it can be answered."""
+            problem = Problem(error=f"this is no valid HTTP request: {msg}", where="request")
+            body = problem.model_dump_json().encode()
+            length = str(len(body))
+            headers = [("content-type", "application/json"), ("content-length", length), ("connection", "close")]
+            for event in (h11.Response(status_code=400, headers=headers), h11.Data(data=body), h11.EndOfMessage()):
+                self.transport.write(self.conn.send(event) or b"")
+            self.transport.close()
 
         def handle_websocket_upgrade(self, event: Any) -> None:
             open_connections.pop(self, None)

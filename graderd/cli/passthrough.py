@@ -23,5 +23,7 @@ def hand_over(module: str, arguments: list[str]) -> None:
         found = False
     if not found:
         raise CliError(module, "this installation does not contain it", "install the whole of graderd")
+    if arguments[:1] == ["--"]:
+        arguments = arguments[1:]
     sys.stdout.flush()
     os.execv(sys.executable, [sys.executable, "-m", module, *arguments])

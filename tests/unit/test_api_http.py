@@ -7,6 +7,7 @@ import contextlib
 import grp
 import json
 import os
+import re
 import stat
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -127,6 +128,19 @@ async def test_a_body_that_never_ends_is_given_up(tmp_path: Path) -> None:
         assert b"408" in await within(5, reader.readline())
         writer.close()
         await writer.wait_closed()
+
+
+async def test_what_is_no_http_is_told_so_and_fills_no_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async with serving(tmp_path) as (_, path):
+        for _ in range(5):
+            reader, writer = await asyncio.open_unix_connection(str(path))
+            writer.write(b"what is this\r\n\r\n")
+            answer = await within(5, reader.read())
+            assert answer.startswith(b"HTTP/1.1 400 ")
+            assert json.loads(answer.partition(b"\r\n\r\n")[2])["where"] == "request"
+            writer.close()
+            await writer.wait_closed()
+    assert caplog.records == []
 
 
 async def test_paths_and_methods_that_do_not_exist(tmp_path: Path) -> None:
@@ -259,7 +273,10 @@ async def test_the_description_is_complete(tmp_path: Path) -> None:
     assert commands == {"Arm", "Disarm", "Stop", "Reset", "Auto", "Manual", "Jog", "Preset", "Renew", "Release"}
     assert set(body["examples"]) >= {"arm", "stop", "jog"}
     assert {"409", "422", "503", "504"} <= set(paths["/v1/commands"]["post"]["responses"])
-    json.dumps(description, allow_nan=False)
+    text = json.dumps(description, allow_nan=False)
+    schemas = set(re.findall(r'"#/components/schemas/(\w+)"', text))
+    assert schemas <= set(description["components"]["schemas"])
+    assert {"Status", "Reply", "Problem", "AxisStatus", "FaultStatus"} <= schemas
 
 
 async def test_requests_that_wait_when_the_daemon_ends_are_answered(

@@ -105,6 +105,8 @@ def test_config_show_prints_a_file_that_is_valid_again(tmp_path: Path, capsys: C
         (["rig", "--dir", "d", "--seed", "1"], "drivers.rig", ["--dir", "d", "--seed", "1"]),
         (["rig", "dataset", "--out", "x"], "drivers.rig.dataset", ["--out", "x"]),
         (["rig", "--", "--help"], "drivers.rig", ["--help"]),
+        (["rig", "dataset", "--help"], "drivers.rig.dataset", ["--help"]),
+        (["rig", "dataset", "--", "--help"], "drivers.rig.dataset", ["--help"]),
         (["can", "dump", "can0", "--json"], "drivers.electrak.dump", ["can0", "--json"]),
         (["can", "dump", "--", "--help"], "drivers.electrak.dump", ["--help"]),
     ],
