@@ -1,11 +1,12 @@
 """Servo bus beside dynamixel-sdk and rustypot: transactions, CPU and event-loop lateness on one virtual wire.
 
-``python benchmarks/dynamixel.py [--seconds S] [--json]``. For each baud rate the virtual servo runs in a process of
-its own and answers as late as a real wire would (request bytes, the factory's 500 µs return delay, reply bytes). Each
-client runs in a process of its own too, on an asyncio loop with a 5 ms ticker beside it: ours natively, the others in
-a thread, as an asyncio program would have to. What the ticker alone takes is taken off their CPU. One
-transaction reads 25 bytes: our telemetry block; rustypot, whose
-addresses end at 255, reads as many from address 0.
+``python benchmarks/dynamixel.py [--seconds S] [--rounds N] [--json]``. For each baud rate the virtual servo runs in a
+process of its own and answers as late as a real wire would (request bytes, the factory's 500 µs return delay, reply
+bytes). Each client runs in a process of its own too, on an asyncio loop with a 5 ms ticker beside it: ours natively,
+the others in a thread, as an asyncio program would have to. What the ticker alone takes is taken off their CPU. One
+transaction reads 25 bytes: our telemetry block; rustypot, whose addresses end at 255, reads as many from address 0.
+
+Other programs on the machine can only slow things down: of N rounds the best is shown.
 
 The bars: at least 90 % of what the wire allows, and at most a tenth of the SDK's CPU at the same rate.
 """
@@ -153,7 +154,7 @@ async def _measure(client: str, port: str, baud_n: int, seconds: float, rate_hz:
 # -- the run --------------------------------------------------------------------------------------------------------
 
 
-def run(seconds: float) -> dict[str, Any]:
+def run(seconds: float, rounds_n: int) -> dict[str, Any]:
     """All clients at all rates; the result as plain data."""
     rows = []
     ticker_percent = _client(NOTHING, "", 0, seconds, None)["cpu_percent"]
@@ -180,7 +181,12 @@ def run(seconds: float) -> dict[str, Any]:
                 servo.stdout.readline()
                 for client in CLIENTS:
                     for rate_hz in (None, SAME_RATE_HZ):
-                        rows.append(_row(client, str(link), baud_n, seconds, rate_hz, ticker_percent))
+                        tries = [
+                            _row(client, str(link), baud_n, seconds, rate_hz, ticker_percent) for _ in range(rounds_n)
+                        ]
+                        best = max if rate_hz is None else min
+                        key = "rate_hz" if rate_hz is None else "cpu_percent"
+                        rows.append(best(tries, key=lambda row: row[key]))
             finally:
                 servo.terminate()
                 servo.wait()
@@ -254,6 +260,7 @@ def main() -> int:
     """Entry point; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=5.0, help="of each measurement (default %(default)s)")
+    parser.add_argument("--rounds", type=int, default=1, help="of which the best is shown (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
     parser.add_argument("--client", choices=(*CLIENTS, NOTHING), help=argparse.SUPPRESS)
     parser.add_argument("--port", help=argparse.SUPPRESS)
@@ -263,7 +270,7 @@ def main() -> int:
     if args.client:
         print(json.dumps(asyncio.run(_measure(args.client, args.port, args.baud, args.seconds, args.rate))))
         return 0
-    result = run(args.seconds)
+    result = run(args.seconds, args.rounds)
     if args.json:
         print(json.dumps(result))
     else:

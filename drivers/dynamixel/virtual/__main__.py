@@ -41,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
             strict_baud=args.strict_baud,
             byte_gap_s=0.0015 if args.strict_gap else 0.1,
             answer_crc_errors=args.answer_crc_errors,
-            linger_s=0.0004 if args.wire_time else 0.0,
+            linger_s=0.0015 if args.wire_time else 0.0,
             seed=args.seed,
         )
         faults = [parse(text) for text in args.fault]

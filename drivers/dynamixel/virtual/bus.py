@@ -19,8 +19,8 @@ from drivers.dynamixel.virtual.timing import baud_of, busy_until, wire_s
 from graderd.hal.clock import Clock, SystemClock
 
 _TICK_S = 0.01
-_SPIN_S = 0.0002
-"""With wire time, the last part of a wait is spun: a sleeping loop wakes too late by about that much."""
+_SPIN_S = 0.001
+"""With wire time, the last part of a wait is spun: a sleeping process wakes too late by up to that much."""
 _RETURN_DELAY_STEP_S = 2e-6
 _STALL_S = 0.03
 """A turn of the event loop that took longer is our own stall, not the client's silence."""
@@ -291,8 +291,9 @@ class VirtualServoBus:
             gap_s = self._faults["trickle"]["gap_s"]
             for index, byte in enumerate(reply):
                 self._later(max(0.0, ahead_s) + index * gap_s, functools.partial(self._put, bytes((byte,))))
-        elif ahead_s > _SPIN_S:
-            self._later(ahead_s - _SPIN_S, functools.partial(self._put_at, reply, ready_s))
+        elif ahead_s > (_SPIN_S if self.wire_time else 0.0):
+            early_s = _SPIN_S if self.wire_time else 0.0
+            self._later(ahead_s - early_s, functools.partial(self._put_at, reply, ready_s))
         else:
             self._put_at(reply, ready_s)
 
