@@ -22,6 +22,7 @@ from drivers.electrak.j1939.node import Identity, J1939Node
 from drivers.electrak.j1939.transport import Message
 from drivers.electrak.ports import BusEvent, BusPort, PortFullError, PortLostError, open_port
 from drivers.electrak.stop import StopWatcher
+from drivers.electrak.ticker import Ticker
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import DeviceError, DeviceMissingError
 from graderd.hal.fault import DeviceFault
@@ -311,24 +312,21 @@ class CanLink:
 
     async def _schedule(self) -> None:
         """Every 20 ms protocol timers, every 100 ms on the same grid control messages; no catching up."""
-        loop = asyncio.get_running_loop()
-        due_s = loop.time()
-        tick_n = 0
+        ticker = Ticker(_POLL_S, kernel=isinstance(self._clock, SystemClock))
         per_acm_n = round(ACM_PERIOD_S / _POLL_S)
-        while True:
-            now_s = self._clock.now_s()
-            if tick_n % per_acm_n == 0 and self._port is not None:
-                self.counters.acm_late_max_s = max(self.counters.acm_late_max_s, loop.time() - due_s)
-                for user in tuple(self._users.values()):
-                    self.send_control(user)
-            self._node.poll(now_s)
-            self._flush()
-            behind_n = max(0, int((loop.time() - due_s) / _POLL_S))
-            if behind_n > per_acm_n:  # the loop stood still: start a new grid
-                due_s, tick_n = loop.time(), -1
-            tick_n += 1
-            due_s += _POLL_S
-            await asyncio.sleep(max(0.0, due_s - loop.time()))
+        tick_n, sent_for_n = 0, -1
+        try:
+            while True:
+                if tick_n // per_acm_n != sent_for_n and self._port is not None:
+                    sent_for_n = tick_n // per_acm_n
+                    self.counters.acm_late_max_s = max(self.counters.acm_late_max_s, ticker.late_s)
+                    for user in tuple(self._users.values()):
+                        self.send_control(user)
+                self._node.poll(self._clock.now_s())
+                self._flush()
+                tick_n += await ticker.wait()
+        finally:
+            ticker.close()
 
     async def _supervise(self) -> None:
         """Open the bus again whenever it was lost, for as long as the link lives."""
