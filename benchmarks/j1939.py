@@ -27,7 +27,8 @@ from typing import Any
 from drivers.electrak.codec import Control, ElectrakCodec, load_database
 from drivers.electrak.j1939.ids import Frame
 from drivers.electrak.link import CanLink
-from drivers.electrak.ports import BusPort, QuietSlcanBus, SlcanPort
+from drivers.electrak.ports import BusPort, SlcanPort
+from drivers.electrak.slcan_bus import QuietSlcanBus
 from drivers.electrak.virtual.slcan import SlcanAdapter
 from drivers.electrak.virtual.wire import Wire
 from graderd.hal.settings import CanSettings

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
+from drivers.electrak.bus_events import BusEvent
 from drivers.electrak.j1939.claim import AddressClaimer, ClaimState
-from drivers.electrak.ports import BusEvent
 from graderd.hal.errors import DeviceError
 from graderd.hal.fault import DeviceFault
 

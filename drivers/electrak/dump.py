@@ -13,9 +13,10 @@ from typing import Any, Final, TextIO
 
 import can
 
+from drivers.electrak.bus_events import BusEvent
 from drivers.electrak.decode import DecodedFrame, FrameDecoder
 from drivers.electrak.j1939.ids import Frame
-from drivers.electrak.ports import BusEvent, PortLostError, open_port
+from drivers.electrak.ports import PortLostError, open_port
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError, DeviceLostError, ProtocolError
 from graderd.hal.settings import CanSettings

@@ -14,13 +14,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
+from drivers.electrak.bus_events import BusEvent
 from drivers.electrak.bus_health import BusHealth
 from drivers.electrak.j1939 import dm1
 from drivers.electrak.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
 from drivers.electrak.j1939.name import Name
 from drivers.electrak.j1939.node import Identity, J1939Node
 from drivers.electrak.j1939.transport import Message
-from drivers.electrak.ports import BusEvent, BusPort, PortFullError, PortLostError, open_port
+from drivers.electrak.ports import BusPort, PortFullError, PortLostError, open_port
 from drivers.electrak.stop import StopWatcher
 from drivers.electrak.ticker import Ticker
 from graderd.hal.clock import Clock, SystemClock

@@ -14,8 +14,9 @@ import can
 import pytest
 
 from drivers.electrak import CanLink, ElectrakActuator
+from drivers.electrak.bus_events import BusEvent, event_of
 from drivers.electrak.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
-from drivers.electrak.ports import BusEvent, PortLostError, SocketCanPort, event_of, lost_from
+from drivers.electrak.ports import PortLostError, SocketCanPort, lost_from
 from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import ActuatorSettings, CanSettings

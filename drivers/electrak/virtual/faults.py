@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from drivers.electrak.virtual.model import Behaviour, Faults, VirtualElectrak
+from drivers.electrak.virtual.model import VirtualElectrak
+from drivers.electrak.virtual.traits import Behaviour, Faults
 
 UNIT_FAULTS: Final = (
     "babble",

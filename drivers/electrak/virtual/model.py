@@ -2,76 +2,26 @@
 
 The caller moves time (:meth:`VirtualElectrak.advance`), hands in frames (:meth:`VirtualElectrak.on_frame`) and takes
 away what the unit sends. Physics and behaviour follow the profile's figures; every doubtful trait is a knob of
-:class:`Behaviour`.
+:class:`~drivers.electrak.virtual.traits.Behaviour`.
 """
 
 from __future__ import annotations
 
 import math
 import random
-from dataclasses import dataclass
 from typing import Final, Literal
 
 from drivers.electrak.codec import Control, ElectrakCodec, Feedback
 from drivers.electrak.j1939.ids import GLOBAL, NULL, Frame, Pgn, destination_of, make_id, pgn_of, source_of
 from drivers.electrak.j1939.name import Name
 from drivers.electrak.profile import load_profile
+from drivers.electrak.virtual.traits import Behaviour, Faults, MotorState
 
 _STEP_S: Final = 0.002
 _BRAKE_S: Final = 0.02
 """Time constant with which the tube stops once the motor is braked."""
 _INRUSH_FACTOR: Final = 1.6
 _OVERRIDE_DUTY_PERCENT: Final = 100.0
-
-
-@dataclass(slots=True)
-class Behaviour:
-    """Traits that the manual leaves open or that differ between units. All may be changed while running."""
-
-    acm_loss: Literal["continue", "stop"] = "continue"
-    """What a move does when control messages stop: go on to the target (assumed of real units), or stop after 5 s."""
-    factory_ones: bool = True
-    """Real units send the feedback's factory bits as 1, the manual says 0."""
-    only_own_control_keeps_awake: bool = True
-    """The manual says "bus activity"; the careful reading is: control messages for this unit."""
-    wake_control_n: int = 2
-    """Control messages to be seen after waking before one with motion enabled counts; a disabled one counts at once."""
-    answers_requests: bool = True
-    """Request (59904) for the address claim is answered; the manual does not list it."""
-    parameter_refuses_motion: bool = False
-    """False: a bad control message is ignored, the last good target stays (seen). True: motion stops (MD manual)."""
-    afm_jitter_s: float = 0.003
-    speed_factor: float = 1.0
-    """Speed against the model's own: 0.7 is a unit 30 % slower."""
-
-
-@dataclass(slots=True)
-class Faults:
-    """Defects that can be switched on one at a time."""
-
-    silent: bool = False
-    stuck: bool = False
-    drift_mm_per_s: float = 0.0
-    garbage: bool = False
-    babble_hz: float = 0.0
-    frozen_feedback: bool = False
-    forced_flags: frozenset[str] = frozenset()
-
-
-@dataclass(slots=True)
-class _Motion:
-    target_mm: float = 0.0
-    enabled: bool = False
-    limit_a: float = 0.0
-    speed_percent: float = 0.0
-    duty_percent: float = 0.0
-    direction: int = 0
-    moving_since_s: float = 0.0
-    stop_short_mm: float = 0.0
-    over_limit_since_s: float | None = None
-    overload: bool = False
-    parameter: bool = False
-    backdrive_mm: float = 0.0
 
 
 class VirtualElectrak:
@@ -110,7 +60,7 @@ class VirtualElectrak:
         self._position_mm = min(max(position_mm, 0.0), self.figures.stroke_mm)
         self._velocity_mm_per_s = 0.0
         self._current_a = 0.0
-        self._motion = _Motion(target_mm=self._position_mm)
+        self._motion = MotorState(target_mm=self._position_mm)
         self._now_s: float | None = None
         self._powered = True
         self._awake = not asleep
@@ -172,7 +122,7 @@ class VirtualElectrak:
         self._powered = False
         self._awake = False
         self._velocity_mm_per_s = self._current_a = 0.0
-        self._motion = _Motion(target_mm=self._position_mm)
+        self._motion = MotorState(target_mm=self._position_mm)
         self._out.clear()
         self._claim_due_s = None
 
