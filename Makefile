@@ -6,7 +6,7 @@ STAMP  := $(VENV)/.installed
 ARGS   ?=
 PYTEST_ARGS ?=
 
-.PHONY: help run test check format lock clean
+.PHONY: help run test faults check format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -25,6 +25,9 @@ run: $(STAMP) ## drive the demonstration on the simulated grader (ARGS=--json fo
 test: $(STAMP) ## run the tests
 	@$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not serial_only" $(PYTEST_ARGS)
 	@$(BIN)/python -m pytest -m serial_only $(PYTEST_ARGS)
+
+faults: $(STAMP) ## inject every fault in every phase of work (ARGS="--short --json" for a part of it)
+	@$(BIN)/python -m tests.fault.campaign $(ARGS)
 
 check: $(STAMP) ## lint, types, import contracts
 	@$(BIN)/ruff check .

@@ -7,6 +7,7 @@ control, and is told as a fault.
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import logging
 import shutil
@@ -75,7 +76,8 @@ class Recorder:
         try:
             self._write(lines)
         except OSError as error:
-            self._tell("recorder_failed", f"{self._settings.directory}: {error.strerror}")
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            self._tell("disk_full" if full else "recorder_failed", f"{self._settings.directory}: {error.strerror}")
 
     def _write(self, lines: list[str]) -> None:
         directory = Path(self._settings.directory)

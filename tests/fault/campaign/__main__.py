@@ -5,18 +5,22 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import os
 import sys
 import tempfile
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 from tests.fault.campaign.conduct import run_case
 from tests.fault.campaign.daemon import BREAKS
 from tests.fault.campaign.model import Case, Outcome, Phase
+from tests.fault.campaign.page import write
 from tests.fault.campaign.stack import Stack
 from tests.fault.campaign.table import ACTUATOR, CAMERA, CAN, SERVO
+from tests.fault.campaign.table_daemon import DAEMON, PERCEPTION
 
-CASES: tuple[Case, ...] = (*CAMERA, *SERVO, *CAN, *ACTUATOR)
+CASES: tuple[Case, ...] = (*CAMERA, *PERCEPTION, *SERVO, *CAN, *ACTUATOR, *DAEMON)
 
 
 def chosen(short: bool, faults: list[str], phases: list[str]) -> list[tuple[Case, Phase]]:
@@ -55,6 +59,16 @@ def _line(outcome: Outcome) -> str:
     return "\n      ".join([text, *outcome.problems])
 
 
+def _about(took_s: float) -> dict[str, object]:
+    """Where and when the results were measured."""
+    return {
+        "measured": f"{datetime.now(UTC):%Y-%m-%d}",
+        "cores": os.cpu_count(),
+        "load": f"{os.getloadavg()[2]:.1f} (15 min mean)",
+        "took": f"{took_s / 60:.0f} min",
+    }
+
+
 def main() -> int:
     """Command line. Status 0 where every injection passed."""
     parser = argparse.ArgumentParser(prog="make faults ARGS=", description=__doc__)
@@ -64,6 +78,7 @@ def main() -> int:
     parser.add_argument("--phase", action="append", default=[], choices=[p.value for p in Phase])
     parser.add_argument("--list", action="store_true", help="list the faults")
     parser.add_argument("--output", type=Path, help="write the results as JSON")
+    parser.add_argument("--page", action="store_true", help="write docs/integrators/fault-campaign.{md,json}")
     parser.add_argument("--break", dest="broken", default="", choices=["", *BREAKS], help="spoil one reaction")
     options = parser.parse_args()
     if options.list:
@@ -75,6 +90,8 @@ def main() -> int:
     results = {"results": [outcome.as_json() for outcome in outcomes]}
     if options.output is not None:
         options.output.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    if options.page:
+        write(results["results"], CASES, _about(time.monotonic() - began_s), Path("docs/integrators"))
     good_n = sum(outcome.passed for outcome in outcomes)
     if options.json:
         sys.stdout.write(json.dumps(results) + "\n")

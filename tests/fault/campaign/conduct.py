@@ -7,7 +7,7 @@ import time
 from contextlib import suppress
 
 from graderd.core.fault_catalogue import CATALOGUE
-from graderd.core.faults import ALL_AXES, Clear, FaultRow, Reaction, catalogue_key
+from graderd.core.faults import Clear, FaultRow, Reaction, catalogue_key
 from tests.fault.campaign.model import Case, Outcome, Phase
 from tests.fault.campaign.stack import CampaignError, JsonObject, Stack
 from tests.fault.campaign.watch import MOVING, axes_of
@@ -17,8 +17,19 @@ BRAKE_S = 0.7
 SLACK_S = 0.4
 """For a loaded machine, on top of every promise: campaign, rig, daemon and pictures share what cores there are."""
 STILL_S = 0.3
+LATCHED_S = 1.3
+"""Drivers show an event for a second; what is still told afterwards is latched."""
 EVERYTHING = tuple(MOVING)
 OUTSIDE_DEG = 0.5
+WAY = {
+    "rotation": ("blade_deg", 15.0),
+    "lift_left": ("lift_left_mm", 40.0),
+    "lift_right": ("lift_right_mm", 40.0),
+    "tilt": ("tilt_mm", 25.0),
+}
+"""How far an axis may still go (deg, mm) once the fault is named: braking, and a look-ahead target of an actuator."""
+LIGHT = ("daemon.lease_lapsed", "daemon.tick_overrun")
+"""Told by a loaded machine at any time; they hold nothing."""
 
 
 def row_of(fault: str) -> FaultRow:
@@ -198,6 +209,8 @@ async def react(stack: Stack, case: Case, outcome: Outcome, from_s: float, befor
     outcome.final_state = str(status.get("mode", "no answer"))
     if stopping:
         outcome.standstill_s = watch.standstill_s(stopping, from_s)
+        if outcome.detection_s is not None:
+            outcome.problems += _ways_too_long(stack, stopping, from_s + outcome.detection_s)
     others = tuple(a for a in EVERYTHING if a not in stopping and a not in axes_of(case.own_motion))
     released_s = time.monotonic()
     if others and outcome.final_state in ("manual", "auto"):
@@ -211,14 +224,27 @@ async def react(stack: Stack, case: Case, outcome: Outcome, from_s: float, befor
     outcome.safe = _judge(stack, case, outcome, from_s) and still
 
 
+def _ways_too_long(stack: Stack, axes: tuple[str, ...], from_s: float) -> list[str]:
+    """Axes that went further after the fault was named than braking takes."""
+    samples = stack.watch.since(from_s)
+    ways = {axis: abs(samples[-1].state[WAY[axis][0]] - samples[0].state[WAY[axis][0]]) for axis in axes if samples}
+    return [
+        f"{axis} went on for {way:.0f} after the fault was named" for axis, way in ways.items() if way > WAY[axis][1]
+    ]
+
+
 def _judge(stack: Stack, case: Case, outcome: Outcome, from_s: float) -> bool:
     """Whether the machine did what was promised; what it did not is added to the problems."""
-    promised_s = BRAKE_S + (case.detect_s if outcome.standstill_from == "injection" else 0.0)
+    named_s = case.detect_s if outcome.detection_s is None else min(case.detect_s, outcome.detection_s)
+    promised_s = BRAKE_S + (named_s if outcome.standstill_from == "injection" else 0.0)
+    if case.stand_s is not None and outcome.standstill_from == "injection":
+        promised_s = case.stand_s
     wrong = []
     if outcome.standstill_s is None or outcome.standstill_s > promised_s + SLACK_S:
         wrong.append(f"standstill after {outcome.standstill_s} s, {promised_s:.1f} s promised")
     if outcome.final_state != outcome.expected_state:
-        wrong.append(f"ended {outcome.final_state}, the catalogue says {outcome.expected_state}")
+        reason = stack.status.get("reason", "")
+        wrong.append(f"ended {outcome.final_state} ({reason}), the catalogue says {outcome.expected_state}")
     if "rotation" not in case.own_motion:
         most_deg = max(abs(s.state["blade_deg"]) for s in stack.watch.since(from_s))
         if most_deg > 60.0 + OUTSIDE_DEG:
@@ -240,7 +266,7 @@ async def recover(stack: Stack, case: Case, outcome: Outcome, before: str) -> No
                 lambda s: not _named(s, case.faults), case.recover_s, f"{case.faults[0]} does not go away"
             )
         else:
-            await asyncio.sleep(0.4)
+            await asyncio.sleep(LATCHED_S)
             if outcome.detected and not _named(await stack.read_status() or {}, case.faults):
                 raise CampaignError(f"{case.faults[0]} went away by itself; the catalogue says: {row.clear}")
         if mode == "stopped":
@@ -287,4 +313,4 @@ def _named(status: JsonObject, faults: tuple[str, ...]) -> list[str]:
     return [f["name"] for f in status.get("faults", []) if f["name"] in faults]
 
 
-__all__ = ["ALL_AXES", "BRAKE_S", "SLACK_S", "enter", "expected_mode", "general", "make_ready", "run_case"]
+__all__ = ["BRAKE_S", "SLACK_S", "detect", "general", "make_ready", "react", "run_case"]

@@ -13,8 +13,9 @@ import json
 import os
 import signal
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -22,34 +23,28 @@ from typing import Any
 
 from graderd.core import machine
 from graderd.core.fault_catalogue import CATALOGUE
-from graderd.core.faults import Reaction
+from graderd.core.faults import Clear, FaultRow, Reaction
 from graderd.runtime import control
 from graderd.runtime.app import daemon as product
-from graderd.runtime.devices import Devices
 from graderd.runtime.perception import PerceptionWorker
 
 WORKER = "tests.fault.campaign.worker"
 
 
+def _replace_catalogue(rows: Mapping[str, FaultRow]) -> None:
+    vars(control)["CATALOGUE"] = rows
+
+
 def _only_warn(key: str) -> None:
-    rows = dict(CATALOGUE)
-    rows[key] = dataclasses.replace(rows[key], reaction=Reaction.WARN)
-    control.CATALOGUE = rows
+    _replace_catalogue(dict(CATALOGUE) | {key: dataclasses.replace(CATALOGUE[key], reaction=Reaction.WARN)})
 
 
 def _hold_nothing() -> None:
-    machine.held_axes = lambda _: frozenset()
-
-
-def _silent_stop() -> None:
-    Devices.hold_all = lambda _: ()  # type: ignore[method-assign]  # this defect is the purpose
-    machine._unheld = lambda goals, _: goals
-    control.ControlLoop._hold = lambda _, __: None  # type: ignore[method-assign]  # this defect is the purpose
+    vars(machine)["held_axes"] = lambda _: frozenset()
 
 
 def _forget_latches() -> None:
-    rows = {key: dataclasses.replace(row, clear=control.Clear.WHEN_GONE) for key, row in CATALOGUE.items()}
-    control.CATALOGUE = rows
+    _replace_catalogue({key: dataclasses.replace(row, clear=Clear.WHEN_GONE) for key, row in CATALOGUE.items()})
 
 
 BREAKS: dict[str, Callable[[], None]] = {
@@ -79,7 +74,14 @@ class Hooks:
             step_s = self._step_s
             time.time = lambda: self._time() + step_s
         if "memory_mb" in wanted:
-            self._kept = [bytearray(os.urandom(1 << 20)) for _ in range(int(wanted["memory_mb"]))]
+            threading.Thread(target=self._take_memory, args=(int(wanted["memory_mb"]),), daemon=True).start()
+
+    def _take_memory(self, wanted_mb: int) -> None:
+        """Little by little beside the event loop, as a leak does."""
+        self._kept.clear()
+        for _ in range(wanted_mb):
+            self._kept.append(bytearray(b"\x01") * (1 << 20))
+            time.sleep(0.005)
 
 
 def main() -> int:
@@ -94,7 +96,7 @@ def main() -> int:
     signal.signal(signal.SIGUSR1, Hooks(options.rig_dir).on_signal)
     os.environ["GRADERD_CAMPAIGN_LIE"] = str(options.rig_dir / "lie.json")
     command = (sys.executable, "-m", WORKER)
-    product.PerceptionWorker = partial(PerceptionWorker, command=command)  # type: ignore[assignment, misc]  # same call
+    vars(product)["PerceptionWorker"] = partial(PerceptionWorker, command=command)
     return product.run_daemon(options.config, False, options.rig_dir, True)
 
 

@@ -90,6 +90,7 @@ class Case:
     needs: str = ""
     detect_s: float = 0.6
     recover_s: float = 12.0
+    stand_s: float | None = None
     own_motion: frozenset[str] = NONE
     before_arm: Action | None = None
     log_errors: tuple[str, ...] = ()

@@ -33,6 +33,7 @@ stop_pgn_n = 64999
 rate_hz = 10.0
 [control]
 memory_warn_mb = 260.0
+overrun_s = 0.06
 [recording]
 directory = "{directory}/records"
 min_free_mb = 0.0

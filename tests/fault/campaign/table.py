@@ -1,4 +1,4 @@
-"""The table of faults that the rig can make: camera, servo, CAN bus and actuators. The daemon's own: ``table_daemon``."""
+"""The faults that the rig can make: camera, servo, CAN bus and actuators. The daemon's own: ``table_daemon``."""
 
 from __future__ import annotations
 
@@ -74,8 +74,9 @@ def _servo(name: str, text: str, faults: str, inject: Action, **more: Any) -> Ca
     return Case(f"servo_{name}", text, named, inject, heal, **more)
 
 
-def _actuator(name: str, text: str, faults: str, inject: Action, **more: Any) -> Case:
-    return Case(f"actuator_{name}", text, tuple(faults.split()), inject, heal, **more)
+def _actuator(name: str, text: str, device: str, conditions: str, fault: str, **more: Any) -> Case:
+    named = tuple(f"{device}.{condition}" for condition in conditions.split())
+    return Case(f"actuator_{name}", f"{device} {text}", named, actuator(fault, device), heal, **more)
 
 
 def _can(name: str, text: str, fault: str, inject: Action, **more: Any) -> Case:
@@ -109,7 +110,8 @@ SERVO = (
     _servo("silence", "no status packet arrives", "no_reply", servo("drop"), short=(TURNING,)),
     _servo("deaf", "no instruction packet arrives", "no_reply", servo("drop_requests")),
     _servo("crc", "a bit of every reply is flipped", "corrupt_replies no_reply", servo("flip")),
-    _servo("crc_some", "a bit of every fourth reply is flipped", "corrupt_replies", servo("flip", rate=0.25), detect_s=1.0),
+    _servo("crc_some", "a bit of every fourth reply is flipped", "corrupt_replies", servo("flip", rate=0.25),
+              detect_s=1.0),
     _servo("truncated", "half of the replies lack their end", "corrupt_replies no_reply", servo("truncate", rate=0.5)),
     _servo("foreign", "replies carry another id", "no_reply", servo("foreign_id")),
     _servo("late", "replies come 0.4 s late", "no_reply", servo("delay", seconds=0.4)),
@@ -152,24 +154,29 @@ CAN = (
 )
 
 ACTUATOR = (
-    _actuator("silence", "the left lift is not heard", "lift_left.no_feedback", actuator("silence", "lift_left"), short=(IDLE, LIFTING)),
-    _actuator("all_silent", "no actuator is heard", "lift_left.no_feedback", actuator("silence")),
-    _actuator("power_cut", "the right lift loses power", "lift_right.no_feedback", actuator("power_cut", "lift_right")),
-    _actuator("restart", "the tilt restarts", "tilt.restarted", actuator("restart", "tilt"), detect_s=1.5),
-    _actuator("garbage", "the left lift sends garbage", "lift_left.implausible_feedback lift_left.no_feedback", actuator("garbage", "lift_left"), detect_s=1.0),
-    _actuator("lying", "the left lift repeats its last position", "lift_left.not_moving", actuator("frozen_feedback", "lift_left"), needs="lift", detect_s=1.6),
-    _actuator("babble", "the tilt sends 500 messages a second", "tilt.feedback_flood", actuator("babble", "tilt"), detect_s=1.0),
-    _actuator("wrong_address", "the right lift answers at another address", "lift_right.wrong_address", actuator("wrong_address", "lift_right"), detect_s=0.8),
-    _actuator("stuck", "the left lift is stuck", "lift_left.overload lift_left.not_moving", actuator("stuck", "lift_left"), needs="lift", detect_s=1.6, short=(LIFTING,)),
-    _actuator("drift", "the load moves the right lift", "lift_right.uncommanded_motion lift_right.backdrive", actuator("drift", "lift_right"), detect_s=2.5, own_motion=frozenset({"lift_right"})),
-    _actuator("override", "the tilt's manual override is used", "tilt.uncommanded_motion", actuator("manual_override", "tilt"), detect_s=2.0, own_motion=frozenset({"tilt"})),
-    _actuator("overload", "4000 N on the left lift", "lift_left.overload", actuator("overload", "lift_left"), needs="lift", detect_s=1.5),
-    _actuator("fatal", "the tilt reports a fatal error", "tilt.fatal", actuator("fatal", "tilt"), short=(TURNING,)),
-    _actuator("low_voltage", "8 V at the left lift", "lift_left.voltage", actuator("voltage_low", "lift_left"), detect_s=1.0),
-    _actuator("high_voltage", "17 V at all actuators", "tilt.voltage", actuator("voltage_high"), detect_s=1.0),
-    _actuator("cold", "-45 °C at the right lift", "lift_right.temperature", actuator("temperature_low", "lift_right"), detect_s=1.0),
-    _actuator("hot", "90 °C at the tilt", "tilt.temperature", actuator("temperature_high", "tilt"), detect_s=1.0),
-    _actuator("backdrive", "the left lift reports backdrive", "lift_left.backdrive", actuator("backdrive", "lift_left")),
-    _actuator("parameter", "the tilt refuses our messages", "tilt.parameter", actuator("parameter", "tilt")),
-    _actuator("saturation", "the right lift is near its most", "lift_right.saturation", actuator("saturation", "lift_right"), detect_s=1.6),
+    _actuator("silence", "is not heard", "lift_left", "no_feedback", "silence", short=(IDLE, LIFTING)),
+    _actuator("power_cut", "loses power", "lift_right", "no_feedback", "power_cut"),
+    _actuator("restart", "restarts", "tilt", "restarted", "restart", detect_s=1.5),
+    _actuator("garbage", "sends garbage", "lift_left", "implausible_feedback no_feedback", "garbage", detect_s=1.0),
+    _actuator("lying", "repeats its last position", "lift_left", "not_moving", "frozen_feedback",
+              needs="lift", detect_s=1.6),
+    _actuator("babble", "sends 500 messages a second", "tilt", "feedback_flood", "babble", detect_s=1.0),
+    _actuator("wrong_address", "answers at another address", "lift_right", "wrong_address", "wrong_address",
+              detect_s=0.8),
+    _actuator("stuck", "is stuck", "lift_left", "overload not_moving", "stuck",
+              needs="lift", detect_s=1.6, short=(LIFTING,)),
+    _actuator("drift", "is moved by its load", "lift_right", "uncommanded_motion backdrive", "drift", detect_s=2.5,
+              own_motion=frozenset({"lift_right"})),
+    _actuator("override", "is moved by its manual override", "tilt", "uncommanded_motion", "manual_override",
+              detect_s=2.0,
+              own_motion=frozenset({"tilt"})),
+    _actuator("overload", "carries 4000 N", "lift_left", "overload", "overload", needs="lift", detect_s=1.5),
+    _actuator("fatal", "reports a fatal error", "tilt", "fatal", "fatal", short=(TURNING,)),
+    _actuator("low_voltage", "gets 8 V", "lift_left", "voltage", "voltage_low", detect_s=1.0),
+    _actuator("high_voltage", "gets 17 V", "tilt", "voltage", "voltage_high", detect_s=1.0),
+    _actuator("cold", "is at -45 °C", "lift_right", "temperature", "temperature_low", detect_s=1.0),
+    _actuator("hot", "is at 90 °C", "tilt", "temperature", "temperature_high", detect_s=1.0),
+    _actuator("backdrive", "reports backdrive", "lift_left", "backdrive", "backdrive"),
+    _actuator("parameter", "refuses our messages", "tilt", "parameter", "parameter"),
+    _actuator("saturation", "works near its most", "lift_right", "saturation", "saturation", detect_s=1.6),
 )  # fmt: skip

@@ -39,7 +39,7 @@ class Sample:
     def moves(self, axis: str) -> bool:
         """Whether an axis moves."""
         name, still = MOVING[axis]
-        return abs(self.state[name]) > still
+        return bool(abs(self.state[name]) > still)
 
 
 class Watch:

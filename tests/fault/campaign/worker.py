@@ -33,5 +33,5 @@ class LyingWorker(product.Worker):
 
 
 if __name__ == "__main__":
-    product.Worker = LyingWorker  # type: ignore[misc]  # the child is the same but for what it says
+    vars(product)["Worker"] = LyingWorker  # the child is the same but for what it says
     sys.exit(product.main())

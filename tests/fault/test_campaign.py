@@ -1,0 +1,82 @@
+"""The shortened fault campaign passes, and a spoiled reaction turns it red."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+from typing import Any
+
+import pytest
+
+from graderd.core.fault_catalogue import CATALOGUE
+from graderd.core.faults import catalogue_key
+from tests.fault.campaign.__main__ import CASES, chosen
+from tests.fault.campaign.daemon import BREAKS
+from tests.fault.campaign.model import Phase
+
+SHORT_S = 240.0
+KEYS = {
+    "fault", "phase", "detected", "detection_s", "safe", "standstill_s", "final_state", "recovered_as_catalogued"
+}  # fmt: skip
+
+
+async def campaign(*arguments: str) -> tuple[int, list[dict[str, Any]]]:
+    """Run it as ``make faults`` does; status and results of its last line."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "tests.fault.campaign", "--json", *arguments),
+        stdout=asyncio.subprocess.PIPE,
+        env=os.environ.copy(),
+    )
+    out, _ = await process.communicate()
+    assert process.returncode is not None
+    return process.returncode, json.loads(out.splitlines()[-1])["results"]
+
+
+def test_the_table_is_large_enough_and_every_name_is_in_the_catalogue() -> None:
+    assert len({case.name for case in CASES}) == len(CASES) >= 40
+    assert len(chosen(True, [], [])) >= 20
+    assert len(chosen(False, [], [])) >= 40 * len(Phase)
+    for case in CASES:
+        for fault in case.faults:
+            device, _, condition = fault.partition(".")
+            assert catalogue_key(device, condition) in CATALOGUE
+        assert case.faults or case.conduct is not None
+
+
+@pytest.mark.serial_only
+@pytest.mark.timeout(SHORT_S + 60.0)
+async def test_the_shortened_campaign_passes() -> None:
+    status, results = await campaign("--short")
+    bad = {f"{r['fault']}, {r['phase']}": r["problems"] for r in results if not r["passed"]}
+    assert bad == {}
+    assert status == 0
+    assert len(results) >= 20
+    assert {phase for r in results if (phase := r["phase"])} == {phase.value for phase in Phase}
+    for result in results:
+        assert result.keys() >= KEYS
+        assert result["detected"] is True
+        assert result["safe"] is True
+        assert result["recovered_as_catalogued"] is True
+        assert isinstance(result["detection_s"], float)
+        assert isinstance(result["standstill_s"], float)
+
+
+@pytest.mark.serial_only
+@pytest.mark.timeout(120.0)
+@pytest.mark.parametrize(
+    ("broken", "fault", "phase", "told"),
+    [
+        ("camera_missing_only_warns", "camera_unplug", "turning", "the catalogue says manual"),
+        ("held_axes_go_on", "camera_black", "turning", "standstill after"),
+        ("latches_let_go", "servo_torque_off", "idle", "went away by itself"),
+    ],
+)
+async def test_a_spoiled_reaction_turns_it_red(broken: str, fault: str, phase: str, told: str) -> None:
+    assert broken in BREAKS
+    status, results = await campaign("--break", broken, "--fault", fault, "--phase", phase)
+    assert status == 1
+    (result,) = results
+    assert not result["passed"]
+    assert any(told in problem for problem in result["problems"]), result["problems"]
