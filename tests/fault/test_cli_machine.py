@@ -1,0 +1,103 @@
+"""The command line against the whole machine as processes: what it says is what the simulated grader does."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.rig.control import RigControl
+from tests.machine import Machine, machine
+
+pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(240)]
+
+
+async def start(directory: Path, *arguments: str) -> asyncio.subprocess.Process:
+    return await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "graderd", *arguments),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+        env={**os.environ, "GRADERD_SOCKET": str(directory / "graderd.sock")},
+    )
+
+
+async def graderd(directory: Path, *arguments: str) -> tuple[int | None, str, str]:
+    """Exit status, stdout and stderr of one command."""
+    process = await start(directory, *arguments)
+    async with asyncio.timeout(90):
+        out, err = await process.communicate()
+    return process.returncode, out.decode(), err.decode()
+
+
+async def armed(whole: Machine) -> None:
+    await whole.until(lambda s: bool(s.readiness) and all(r.met for r in s.readiness if r.mandatory))
+    status, out, err = await graderd(whole.directory, "arm")
+    assert status == 0, err
+    assert "armed: manual" in out
+
+
+async def test_jogs_move_what_they_say_and_no_further(tmp_path: Path) -> None:
+    async with machine(tmp_path) as whole, RigControl(tmp_path / "control.sock") as rig:
+        await armed(whole)
+        for axis, value, device, ends_at, tolerance in (
+            ("rotate", "+8deg", "rotation", 8.0, 0.6),
+            ("rotate", "=-5deg", "rotation", -5.0, 0.6),
+            ("lift", "+15mm", "lift_left", 115.0, 2.5),
+            ("tilt", "60mm", "tilt", 60.0, 2.5),
+        ):
+            status, out, err = await graderd(tmp_path, "jog", axis, value, "--json")
+            assert status == 0, err
+            result = json.loads(out)
+            assert result["arrived"] is True
+            assert result["measured"][device] == pytest.approx(ends_at, abs=tolerance)
+        state: dict[str, Any] = await rig.request("state")
+        assert state["blade_deg"] == pytest.approx(-5.0, abs=0.6)
+        status, _, err = await graderd(tmp_path, "jog", "rotate", "100deg")
+        assert status == 1
+        assert "beyond its limits" in err
+        assert err.count("\n") == 1
+        status, _, _ = await graderd(tmp_path, "stop", "--reason", "end of the test")
+        assert status == 0
+        status, _, err = await graderd(tmp_path, "jog", "rotate", "+5deg")
+        assert status == 1
+        assert "Reset, arm, then manual" in err
+        assert (await whole.status()).last_stop.startswith("end of the test")
+
+
+async def test_the_blade_stands_when_the_jogs_process_is_killed(tmp_path: Path) -> None:
+    async with machine(tmp_path) as whole, RigControl(tmp_path / "control.sock") as rig:
+        await armed(whole)
+        jog = await start(tmp_path, "jog", "rotate", "50deg")
+        state: dict[str, Any] = {"blade_velocity_deg_per_s": 0.0}
+        async with asyncio.timeout(30):
+            while abs(state["blade_velocity_deg_per_s"]) < 10.0:
+                state = await rig.request("state")
+                await asyncio.sleep(0.01)
+        jog.send_signal(signal.SIGKILL)
+        killed_s = time.monotonic()
+        while abs(state["blade_velocity_deg_per_s"]) > 0.2:
+            assert time.monotonic() - killed_s < 3.0
+            state = await rig.request("state")
+            await asyncio.sleep(0.01)
+        await jog.communicate()
+        held = await whole.until(lambda s: s.lease is None)
+        assert held.mode == "manual"
+        assert held.reason == "released"
+        assert state["blade_deg"] < 40.0
+
+
+async def test_a_wrong_configuration_is_told_and_nothing_starts(tmp_path: Path) -> None:
+    config = tmp_path / "wrong.toml"
+    config.write_text("[rotation]\nmax_dg = 45.0\n")
+    status, out, err = await graderd(tmp_path, "run", "--config", str(config))
+    assert status == 2
+    assert out == ""
+    assert "Did you mean rotation.max_deg?" in err
+    assert "Traceback" not in err
