@@ -3,28 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from graderd.hal.camera import ColorImage, DepthImage
 
-CAMERA_FAULTS: dict[str, tuple[str, dict[str, float]]] = {
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One number of a fault: what it is by default, and what makes sense."""
+
+    default: float
+    least: float
+    most: float
+
+
+_SHIFT = Parameter(0.0, -0.3, 0.3)
+
+CAMERA_FAULTS: dict[str, tuple[str, dict[str, Parameter]]] = {
     "freeze": ("the same picture again and again under new numbers", {}),
     "black": ("no light in the colour picture", {}),
     "blown_out": ("the colour picture overexposed", {}),
-    "blocked": ("something covers this share of both lenses", {"share": 1.0}),
-    "blurred": ("out of focus, by so many pixels at 640 wide", {"sigma_px": 7.0}),
-    "torn": ("depth from so many frames earlier than colour", {"frames_n": 3}),
+    "blocked": ("something covers this share of both lenses", {"share": Parameter(1.0, 0.0, 1.0)}),
+    "blurred": ("out of focus, by so many pixels at 640 wide", {"sigma_px": Parameter(7.0, 0.3, 60.0)}),
+    "torn": ("depth from so many frames earlier than colour", {"frames_n": Parameter(3, 1, 30)}),
     "knocked": (
         "both imagers moved (vehicle frame) and turned (about their own X, Y, Z)",
         {
-            "x_m": 0.02,
-            "y_m": 0.03,
-            "z_m": 0.0,
-            "turn_x_deg": 4.0,
-            "turn_y_deg": -3.0,
-            "turn_z_deg": 2.0,
+            "x_m": replace(_SHIFT, default=0.02),
+            "y_m": replace(_SHIFT, default=0.03),
+            "z_m": _SHIFT,
+            "turn_x_deg": Parameter(4.0, -30.0, 30.0),
+            "turn_y_deg": Parameter(-3.0, -30.0, 30.0),
+            "turn_z_deg": Parameter(2.0, -30.0, 30.0),
         },
     ),
     "wrong_resolution": ("pictures at half the size asked for", {}),
@@ -33,22 +46,24 @@ CAMERA_FAULTS: dict[str, tuple[str, dict[str, float]]] = {
     "unplug": ("the camera is gone", {}),
     "settings_lost": ("exposure and white balance are not what was set", {}),
 }
-"""Name: what it is, and its parameters with defaults."""
+"""Name: what it is, and its parameters."""
 
 
 def parameters(fault: str, given: Mapping[str, float]) -> dict[str, float]:
     """The parameters of ``fault`` with defaults filled in.
 
     Raises:
-        ValueError: no such fault or parameter.
+        ValueError: no such fault or parameter, or a value that makes no sense.
     """
     if fault not in CAMERA_FAULTS:
         raise ValueError(f"no camera fault {fault!r}; known: {', '.join(CAMERA_FAULTS)}")
-    defaults = CAMERA_FAULTS[fault][1]
-    unknown = sorted(given.keys() - defaults.keys())
-    if unknown:
-        raise ValueError(f"camera fault {fault!r} has no {', '.join(unknown)}; it has {sorted(defaults)}")
-    return {**defaults, **given}
+    known = CAMERA_FAULTS[fault][1]
+    for name, value in given.items():
+        if name not in known:
+            raise ValueError(f"camera fault {fault!r} has no {name}; it has {sorted(known)}")
+        if not known[name].least <= value <= known[name].most:
+            raise ValueError(f"{name} of {fault!r} is {value}, it goes from {known[name].least} to {known[name].most}")
+    return {name: given.get(name, parameter.default) for name, parameter in known.items()}
 
 
 def spoil(

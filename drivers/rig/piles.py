@@ -23,7 +23,7 @@ WINDROW_X_M, WINDROW_Y_M = (-0.50, 0.35), (0.50, 0.80)
 blade that turns from 0 to +45 degrees keeps the soil before it even. Its left end leaves the layer behind and takes in
 the windrow's foot instead; its right end, which gathers what it sweeps, finds the strip bare."""
 TOE_M = -0.10
-"""Gap between the blade's face and the foot of a heap."""
+"""Where a heap's near foot lies ahead of the face of a blade at angle 0; negative: the heap leans on the blade."""
 
 
 class SceneZone(StrEnum):
@@ -61,8 +61,8 @@ def layer(
 def lay_scene(field: SoilField, zone: SceneZone, x_m: float, pose: BladePose, seed: int = 0) -> None:
     """Empty the bed and lay ``zone`` in front of a blade whose axis stands at bed ``x_m``.
 
-    Heaps have their near foot ``TOE_M`` ahead of the face of a blade at angle 0; what would lie under or behind a
-    blade that is turned is left out. The even layer goes on behind the blade too, as if it had been let down into it.
+    Heaps have their near foot ``TOE_M`` ahead of the face of a blade at angle 0; what would lie under or behind the
+    blade is left out. The even layer goes on behind the blade too, as if it had been let down into it.
     """
     field.clear()
     if zone is SceneZone.NONE:

@@ -242,6 +242,21 @@ def test_rig_soil_texture_stays_on_the_ground(materials: Materials) -> None:
     assert np.corrcoef(seen, moved)[0, 1] > 0.6
 
 
+@pytest.mark.parametrize("height_m", [0.0, 0.3, 0.54, 0.56, 1.5])
+def test_rig_pictures_of_any_bed_are_whole(materials: Materials, height_m: float) -> None:
+    """Even one so full that the camera is buried; at either end of the bed, at any angle."""
+    field = SoilField()
+    field.heights_m += height_m
+    renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, materials=materials)
+    for x_m, angle_deg, lift_m in ((0.0, 90.0, 0.0), (0.8, -60.0, 0.195), (7.0, 45.0, -0.1), (8.0, 180.0, 0.0)):
+        state = state_of(field, x_m, BladePose(angle_deg, lift_m, 5.0, 15.0))
+        color, depth = renderer.render(state, Look())
+        assert color.shape == (200, 320, 3)
+        assert depth is not None
+        assert depth.shape == (240, 424)
+        assert np.isfinite(renderer.render_depth_m(state, Look())).all()
+
+
 def test_rig_a_knock_moves_the_picture(materials: Materials) -> None:
     color_pose, depth_pose = knocked((0.02, 0.03, 0.0), (4.0, -3.0, 2.0))
     straight = Renderer(COLOR_SIZE, DEPTH_SIZE, materials=materials)
