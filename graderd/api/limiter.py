@@ -12,6 +12,7 @@ import json
 from collections.abc import Awaitable, Callable
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocketDisconnect
 
 from graderd.api.closing import Closing
 from graderd.api.problem import Problem, answer
@@ -72,6 +73,8 @@ class Limiter:
         self._websockets_n += 1
         try:
             await self._app(scope, receive, send)
+        except WebSocketDisconnect:
+            pass  # the client went while it was being answered
         finally:
             self._websockets_n -= 1
 

@@ -142,7 +142,8 @@ async def _until_closed(socket: WebSocket, work: Coroutine[Any, Any, None], clos
             if error is not None and not isinstance(error, WebSocketDisconnect | RuntimeError):
                 raise error
         if closing.begun:
-            await socket.close(1001, "the daemon ends")
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                await socket.close(1001, "the daemon ends")
     finally:
         for task in tasks:
             task.cancel()

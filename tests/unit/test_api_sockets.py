@@ -176,3 +176,23 @@ async def test_the_daemons_end_ends_the_streams(tmp_path: Path, caplog: pytest.L
         assert socket.close_code in (1001, 1012)
     assert daemon.state.lease is None
     assert [record for record in caplog.records if record.levelname == "ERROR"] == []
+
+
+async def test_clients_that_vanish_at_any_moment_leave_nothing_behind(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    handshake = (
+        b"GET /v1/%s HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+    )
+    async with serving(tmp_path, limits=ApiLimits(accept_rate_hz=1e4)) as (daemon, path):
+        before = len(asyncio.all_tasks())
+        for number in range(60):
+            _, writer = await asyncio.open_unix_connection(str(path))
+            writer.write(handshake % (b"stream", b"jog")[number % 2])
+            await asyncio.sleep((number % 5) * 0.002)
+            writer.transport.abort()
+        await daemon.until(lambda: len(asyncio.all_tasks()) <= before)
+        async with connect(path, "/v1/stream") as stream:
+            await stream.recv()
+    assert [record for record in caplog.records if record.levelname == "ERROR"] == []
