@@ -10,6 +10,7 @@ from typing import Final
 from drivers.electrak.codec import Control, ElectrakCodec, Feedback
 from drivers.electrak.link import CanLink
 from drivers.electrak.monitor import DISARMING, FAILING, INFORMATIVE, LATCHING, FaultMemory, FeedbackMonitor
+from drivers.electrak.overload import OverloadPolicy, Verdict
 from drivers.electrak.planner import Motion, MotionPlanner
 from drivers.electrak.profile import load_profile
 from drivers.electrak.thermal import ThermalGuard
@@ -33,7 +34,6 @@ _RECOVERY_N: Final = 3
 _TRUST_N: Final = 10
 """Plausible messages in a row after which feedback is believed again."""
 _CLOSE_REPEATS_N: Final = 3
-_RETRY_PAUSE_S: Final = 1.0
 _VELOCITY_N: Final = 3
 
 
@@ -52,7 +52,7 @@ class ElectrakActuator:
     def __init__(self, name: str, settings: ActuatorSettings, link: CanLink, clock: Clock | None = None) -> None:
         self.name = name
         self.settings = settings
-        self.profile = load_profile(settings.profile)
+        self.profile = load_profile(settings.profile).with_figures(settings.figures)
         figures = self.profile.figures
         self._check_settings()
         self._link = link
@@ -75,11 +75,9 @@ class ElectrakActuator:
         self._target_at_s = 0.0
         self._sent: Reading[float] | None = None
         self._sent_enabled = False
-        self._retries_left_n = settings.overload_retries_n
-        self._overload_at_s: float | None = None
-        self._overload_seen = False
+        self._overload = OverloadPolicy(settings.overload_retries_n)
         self._claimed_name: int | None = None
-        self._counters = {"feedback_n": 0, "control_n": 0, "overloads_n": 0, "restarts_n": 0, "target_timeouts_n": 0}
+        self._counters = {"feedback_n": 0, "control_n": 0, "restarts_n": 0, "target_timeouts_n": 0}
 
     # -- what is known ----------------------------------------------------------------------------------------------
 
@@ -102,7 +100,11 @@ class ElectrakActuator:
     def telemetry(self) -> ActuatorTelemetry:
         """Newest readings, each with its time."""
         feedback, at_s = self._feedback, self._feedback_at_s
-        counters = {**self._counters, "bad_feedback_n": self._monitor.bad_n}
+        counters = {
+            **self._counters,
+            "overloads_n": self._overload.overloads_n,
+            "bad_feedback_n": self._monitor.bad_n,
+        }
         if feedback is None:
             return ActuatorTelemetry(thermal_load=self._thermal.load, target_sent_mm=self._sent, counters=counters)
         return ActuatorTelemetry(
@@ -178,8 +180,7 @@ class ElectrakActuator:
             raise DeviceRefusedError(self.name, f"cannot arm with {', '.join(sorted(left))}: {details}")
         self._planner.hold()
         self._monitor.reset(now_s)
-        self._retries_left_n = self.settings.overload_retries_n
-        self._overload_at_s = None
+        self._overload.rearm()
         self._lifecycle = Lifecycle.ACTIVE
 
     async def disarm(self) -> None:
@@ -272,7 +273,7 @@ class ElectrakActuator:
             self._faults.clear("no_feedback", "wrong_address")
         if self._good_n >= _TRUST_N:
             self._faults.clear("implausible_feedback")
-        self._overload(feedback, now_s)
+        self._on_overload_flag("overload" in feedback.flags, now_s)
         self._watch(now_s)
 
     def on_claim(self, name: int, solicited: bool, now_s: float) -> None:
@@ -304,8 +305,7 @@ class ElectrakActuator:
         if self._planner.target_mm is not None and now_s - self._target_at_s > self.settings.target_timeout_s:
             self._counters["target_timeouts_n"] += 1
             self._planner.hold()
-        waiting = self._overload_at_s is not None
-        may_move = self._thermal.may_move(now_s) and not waiting
+        may_move = self._thermal.may_move(now_s) and not self._overload.waiting
         return self._planner.control(self._motion(now_s), may_move=may_move)
 
     def _motion(self, now_s: float) -> Motion:
@@ -326,25 +326,14 @@ class ElectrakActuator:
             velocity = (feedback.position_mm - first_mm) / (now_s - first_s)
             self._velocity_mm_per_s = min(max(velocity, -fastest), fastest)
 
-    def _overload(self, feedback: Feedback, now_s: float) -> None:
-        """The latch in the actuator is reset by the disabled messages; ours by retries or by arming."""
-        is_set = "overload" in feedback.flags
-        if is_set and not self._overload_seen:
-            self._counters["overloads_n"] += 1
-            if self._lifecycle is Lifecycle.ACTIVE and self._retries_left_n > 0:
-                self._retries_left_n -= 1
-                self._overload_at_s = now_s
-                if self._sent_enabled:
-                    self._link.send_control(self)
-            else:
-                limit_a = self.settings.current_limit_a
-                tried_n = self.settings.overload_retries_n
-                detail = f"more than {limit_a:.1f} A for 50 ms" + (f", {tried_n} retries used up" if tried_n else "")
-                self._faults.set("overload", detail, now_s)
-        self._overload_seen = is_set
-        paused_s = 0.0 if self._overload_at_s is None else now_s - self._overload_at_s
-        if not is_set and paused_s > _RETRY_PAUSE_S:
-            self._overload_at_s = None
+    def _on_overload_flag(self, tripped: bool, now_s: float) -> None:
+        verdict = self._overload.on_feedback(tripped, self._lifecycle is Lifecycle.ACTIVE, now_s)
+        if verdict is Verdict.RETRY and self._sent_enabled:
+            self._link.send_control(self)  # motion disabled now, not with the next period
+        elif verdict is Verdict.LATCH:
+            tried_n = self.settings.overload_retries_n
+            detail = f"more than {self.settings.current_limit_a:.1f} A for 50 ms"
+            self._faults.set("overload", detail + (f", {tried_n} retries used up" if tried_n else ""), now_s)
 
     def _watch(self, now_s: float) -> None:
         """Draw the consequences: lost feedback fails the axis, disarming faults take it out of the active state."""
@@ -388,7 +377,7 @@ class ElectrakActuator:
         self._heard.clear()
         self._good_n = 0
         self._sent, self._sent_enabled = None, False
-        self._overload_at_s, self._overload_seen = None, False
+        self._overload.rearm()
         self._claimed_name = None
 
     def _check_settings(self) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from importlib import resources
 from typing import Any
 
@@ -77,6 +79,27 @@ class ActuatorProfile:
     unknown: frozenset[str]
     """Names of figures that are assumptions."""
     sources: dict[str, str]
+
+    def with_figures(self, measured: Mapping[str, float]) -> ActuatorProfile:
+        """The same model with figures that were measured on the bench; those are no longer assumptions.
+
+        Raises:
+            WrongDeviceError: a name is no figure of a profile; the message has the nearest one.
+        """
+        for name in measured:
+            if name not in self.sources:
+                near = difflib.get_close_matches(name, self.sources, n=1)
+                remedy = f"Did you mean {near[0]}?" if near else f"Known: {', '.join(sorted(self.sources))}"
+                raise WrongDeviceError(f"figures of {self.name}", f"there is no figure {name!r}", remedy)
+        if not measured:
+            return self
+        figures: dict[str, Any] = asdict(self.figures) | dict(measured)
+        return replace(
+            self,
+            figures=Figures(**figures),
+            unknown=self.unknown - measured.keys(),
+            sources=self.sources | dict.fromkeys(measured, "settings"),
+        )
 
 
 def read_layout(layout: str) -> str:

@@ -94,6 +94,10 @@ class ActuatorSettings(Settings):
     feedback_timeout_s: Positive = Field(0.35, description="three missing feedback messages: the actuator is lost")
     target_timeout_s: Positive = Field(0.3, description="a target not renewed for so long becomes a hold")
     overload_retries_n: int = Field(0, ge=0, le=5, description="automatic retries after an overload before it latches")
+    figures: dict[str, NotNegative] = Field(
+        default_factory=dict,
+        description="measured figures that replace the profile's, for example {speed_no_load_mm_per_s = 24.5}",
+    )
 
     @model_validator(mode="after")
     def _limits(self) -> ActuatorSettings:

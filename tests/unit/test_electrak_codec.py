@@ -149,3 +149,11 @@ def test_the_dbc_is_usable_by_other_tools(layout: str) -> None:
     again = cantools.database.load_string(database.as_dbc_string(), strict=True)
     assert [m.name for m in again.messages] == ["ACM", "AFM"]
     assert all(m.protocol == "j1939" and m.is_extended_frame for m in again.messages)
+
+
+def test_measured_figures_replace_the_profiles_and_are_known_from_then_on() -> None:
+    profile = load_profile("electrak_md_a050").with_figures({"speed_no_load_mm_per_s": 24.5})
+    assert profile.figures.speed_no_load_mm_per_s == 24.5
+    assert "speed_no_load_mm_per_s" not in profile.unknown
+    with pytest.raises(WrongDeviceError, match="Did you mean dead_zone_mm"):
+        profile.with_figures({"dead_zome_mm": 1.0})
