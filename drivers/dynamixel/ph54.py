@@ -11,30 +11,27 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import math
-from collections import Counter
 from collections.abc import Coroutine
 from dataclasses import replace
 
 from drivers.dynamixel import arming
-from drivers.dynamixel.bus import BusLog, ServoBus, ServoRefusedError
+from drivers.dynamixel.bus import BusLog, ServoRefusedError
 from drivers.dynamixel.calibration import Calibration
 from drivers.dynamixel.codec import StatusError
 from drivers.dynamixel.command import CommandSlot
 from drivers.dynamixel.device import EXTENDED_MODE, PATIENT_N, POSITION_MODE, Difference, Ph54Device
+from drivers.dynamixel.link import ServoLink, condition_of
 from drivers.dynamixel.observer import MOTION_FAULTS, ServoObserver
-from drivers.dynamixel.ports import ListPorts, find_port, system_ports
+from drivers.dynamixel.ports import ListPorts, system_ports
 from drivers.dynamixel.table import ControlTable
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import (
     CommandRangeError,
     DeviceError,
     DeviceLostError,
-    DeviceMissingError,
     DeviceRefusedError,
     DeviceTimeoutError,
     LifecycleError,
-    WrongDeviceError,
 )
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
@@ -48,7 +45,6 @@ _HEALTH_EVERY_S = 0.1
 _GOALS_EVERY_S = 0.5
 _RECONNECT_FIRST_S = 0.1
 _RECONNECT_MOST_S = 1.0
-_REBOOT_S = 5.0
 _STOP_S = 0.5
 """A disarm gives the blade so long to come to rest before torque goes off."""
 _STILL_READS_N = 5
@@ -78,21 +74,16 @@ class Ph54Rotator:
         self.settings = settings
         self.table = ControlTable.load(settings.profile)
         self.calibration = Calibration.of(settings, self.table)
-        self.firmware_version: int | None = None
         self._mode = EXTENDED_MODE if self.calibration.needs_turns else POSITION_MODE
         self._clock: Clock = clock or SystemClock()
-        self._bus_log = bus_log
-        self._list_ports = list_ports
+        self._link = ServoLink(settings, self.table, self._mode, self._clock, bus_log, list_ports)
         self._lifecycle = Lifecycle.CLOSED
         self._observer = ServoObserver(DEVICE, settings, self.table, self.calibration, self._clock)
         self._command = CommandSlot(settings, self.calibration)
-        self._bus: ServoBus | None = None
-        self._device: Ph54Device | None = None
         self._task: asyncio.Task[None] | None = None
         self._turn = asyncio.Lock()
         self._wake = asyncio.Event()
         self._readers: list[asyncio.Future[None]] = []
-        self._past: Counter[str] = Counter()
         self._torque_is_ours = False
 
     # -- what it is -------------------------------------------------------------------------------------------
@@ -105,11 +96,16 @@ class Ph54Rotator:
     @property
     def port(self) -> str | None:
         """The port in use; None while the wire is not open."""
-        return self._bus.port if self._bus is not None else None
+        return self._link.bus.port if self._link.bus is not None else None
+
+    @property
+    def firmware_version(self) -> int | None:
+        """Of the servo last identified."""
+        return self._link.firmware_version
 
     def telemetry(self) -> RotatorTelemetry:
         """Newest readings, each with its time; ``counters`` tell the wire's history."""
-        return replace(self._observer.telemetry, counters=self._counters())
+        return replace(self._observer.telemetry, counters=self._link.counters())
 
     def faults(self) -> tuple[DeviceFault, ...]:
         """Conditions present now. Events (trips, lost turns) stay visible for a second after they happened."""
@@ -122,11 +118,6 @@ class Ph54Rotator:
         await reader
         return self._observer.telemetry
 
-    def _counters(self) -> dict[str, int]:
-        now = Counter(self._bus.counters()) if self._bus is not None else Counter[str]()
-        low_latency_n = now.pop("low_latency_n", 0)
-        return {**(self._past + now), "low_latency_n": low_latency_n}
-
     # -- lifecycle --------------------------------------------------------------------------------------------
 
     async def open(self) -> None:
@@ -137,9 +128,9 @@ class Ph54Rotator:
         try:
             await self._connect()
         except BaseException as e:
-            self._disconnect()
+            self._link.disconnect()
             if isinstance(e, DeviceError):
-                self._observer.faults.set(_condition(e), e.cause, self._clock.now_s())
+                self._observer.faults.set(condition_of(e), e.cause, self._clock.now_s())
             raise
         self._lifecycle = Lifecycle.STANDBY
         self._start()
@@ -153,7 +144,7 @@ class Ph54Rotator:
             )
         async with self._turn:
             self._require(Lifecycle.STANDBY)
-            device = self._connected()
+            device = self._link.device
             self._torque_is_ours = True
             counts = await arming.power_up(device, self.settings, self.calibration)
             if self._lifecycle is not Lifecycle.STANDBY:  # closed in the meantime
@@ -207,14 +198,14 @@ class Ph54Rotator:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await task
-        self._disconnect()
+        self._link.disconnect()
         self._command.forget()
         self._tell_readers()
 
     async def _power_down(self, *, off: bool, leaving: bool = False) -> None:
         """Hold, wait for rest, then torque off where asked; leaving with torque on, the watchdog is taken off duty."""
         async with self._turn:
-            device = self._connected()
+            device = self._link.device
             self._command.hold()
             loop = asyncio.get_running_loop()
             until_s, still_n = loop.time() + _STOP_S, 0
@@ -240,31 +231,18 @@ class Ph54Rotator:
         self._require(Lifecycle.STANDBY)
         async with self._turn:
             self._require(Lifecycle.STANDBY)
-            device = self._connected()
             self._lifecycle = Lifecycle.FAILED
             self._torque_is_ours = False
             try:
-                await device.reboot()
-                await self._await_return(device)
-                await self._look_around(device)
+                await self._link.reboot()
+                await self._look_around(self._link.device)
             except DeviceError as e:
-                self._observer.faults.set(_condition(e), e.cause, self._clock.now_s())
-                if self._bus is not None:
-                    self._bus.close()  # the servo task finds the line closed and starts anew
+                self._observer.faults.set(condition_of(e), e.cause, self._clock.now_s())
+                if self._link.bus is not None:
+                    self._link.bus.close()  # the servo task finds the line closed and starts anew
                 raise
             if self._lifecycle is Lifecycle.FAILED:
                 self._lifecycle = Lifecycle.STANDBY
-
-    async def _await_return(self, device: Ph54Device) -> None:
-        until_s = asyncio.get_running_loop().time() + _REBOOT_S
-        while True:
-            await asyncio.sleep(0.05)
-            try:
-                self.firmware_version = await device.identify(self._mode)
-                return
-            except DeviceTimeoutError:
-                if asyncio.get_running_loop().time() > until_s:
-                    raise
 
     async def verify_profile(self) -> list[Difference]:
         """Read every register and compare it with the firmware profile; reads only, in every open state.
@@ -275,7 +253,7 @@ class Ph54Rotator:
         """
         if self._lifecycle not in (Lifecycle.STANDBY, Lifecycle.ACTIVE):
             raise LifecycleError(DEVICE, f"cannot read the servo while {self._lifecycle}", "Check the wire")
-        return await self._connected().verify(self._mode)
+        return await self._link.device.verify(self._mode)
 
     def confirm_turns(self) -> None:
         """The operator says that the angle shown is the blade's: whole turns are known again."""
@@ -288,36 +266,10 @@ class Ph54Rotator:
 
     # -- connection -------------------------------------------------------------------------------------------
 
-    def _connected(self) -> Ph54Device:
-        if self._device is None:
-            raise DeviceLostError(DEVICE, "the servo is not connected", "Check the USB cable")
-        return self._device
-
     async def _connect(self) -> None:
-        rates = self.table.profile["bus"]["baud_n"]
-        if self.settings.baud_n not in rates:
-            raise DeviceRefusedError(
-                DEVICE, f"{self.table.title} cannot run at {self.settings.baud_n} bit/s", f"Choose one of {rates}"
-            )
-        port = find_port(self.settings.port, self.settings.usb_serial_number, self._list_ports)
-        bus = ServoBus(port, self.settings.baud_n, clock=self._clock, bus_log=self._bus_log)
-        bus.open()
-        self._bus = bus
         self._observer.new_wire()
-        device = Ph54Device(bus, self.table, self.settings.servo_id_n)
-        self.firmware_version = await device.identify(self._mode)
-        await self._look_around(device)
-        self._device = device
+        await self._look_around(await self._link.connect())
         self._observer.faults.clear(*_LINK_FAULTS)
-
-    def _disconnect(self) -> None:
-        self._device = None
-        if self._bus is not None:
-            bus, self._bus = self._bus, None
-            bus.close()
-            counted = bus.counters()
-            counted.pop("low_latency_n")
-            self._past.update(counted)
 
     async def _look_around(self, device: Ph54Device) -> None:
         """First readings of a servo just found, and what its registers tell of the time without us."""
@@ -363,12 +315,12 @@ class Ph54Rotator:
         pause_s = _RECONNECT_FIRST_S
         while True:
             try:
-                if self._device is None or self._bus is None or not self._bus.is_open:
-                    self._disconnect()
+                if not self._link.is_up:
+                    self._link.disconnect()
                     async with self._turn:
                         await self._connect()
                         self._lifecycle = Lifecycle.STANDBY
-                    self._past["reconnects_n"] += 1
+                    self._link.happened["reconnects_n"] += 1
                     log.info("%s: servo found at %s", DEVICE, self.port)
                 pause_s = _RECONNECT_FIRST_S
                 await self._serve()
@@ -381,7 +333,7 @@ class Ph54Rotator:
             pause_s = min(_RECONNECT_MOST_S, 2 * pause_s)
 
     def _fail(self, error: DeviceError) -> None:
-        condition, faults = _condition(error), self._observer.faults
+        condition, faults = condition_of(error), self._observer.faults
         if condition == "no_reply" and self._observer.damaged_lately():
             condition = "corrupt_replies"
         if faults.set(condition, error.cause, self._clock.now_s()):
@@ -389,7 +341,7 @@ class Ph54Rotator:
         faults.clear(*(c for c in _LINK_FAULTS if c != condition), *MOTION_FAULTS)
         self._lifecycle = Lifecycle.FAILED
         self._command.forget()
-        self._disconnect()
+        self._link.disconnect()
         self._tell_readers()
 
     def _tell_readers(self) -> None:
@@ -405,7 +357,7 @@ class Ph54Rotator:
         next_s = loop.time()
         while True:
             async with self._turn:
-                await self._cycle(self._connected())
+                await self._cycle(self._link.device)
             next_s = max(next_s + period_s, loop.time())
             await self._until(next_s)
 
@@ -421,14 +373,14 @@ class Ph54Rotator:
                     timer.cancel()
             self._wake.clear()
             async with self._turn:
-                await self._tolerant(self._send_command(self._connected()))
+                await self._tolerant(self._send_command(self._link.device))
 
     async def _cycle(self, device: Ph54Device) -> None:
         """One poll: command, telemetry, and now and then what changes rarely; a command never waits for two reads."""
         observer, now_s = self._observer, self._clock.now_s()
         self._wake.clear()
         if self._command.expired(now_s):
-            self._past["goal_timeouts_n"] += 1
+            self._link.happened["goal_timeouts_n"] += 1
             self._command.hold()
         await self._tolerant(self._send_command(device))
         await self._tolerant(observer.read_telemetry(device, self._standing_goal_deg()))
@@ -440,8 +392,8 @@ class Ph54Rotator:
             await self._tolerant(self._send_command(device))
             await self._tolerant(self._check_goals(device))
         await self._tolerant(self._protect(device))
-        if self._bus is not None:
-            observer.count_damage(self._bus)
+        if self._link.bus is not None:
+            observer.count_damage(self._link.bus)
 
     def _standing_goal_deg(self) -> float | None:
         """What the servo was last told to do; None while nothing is powered by us."""
@@ -479,9 +431,9 @@ class Ph54Rotator:
         try:
             await step
         except DeviceTimeoutError as e:
-            silent_s = self._clock.now_s() - (self._bus.last_valid_s if self._bus else -math.inf)
+            silent_s = self._link.silence_s()
             if silent_s > self.settings.reply_timeout_s:
-                c = self._bus.counters() if self._bus else {}
+                c = self._link.counters()
                 seen = f"{c.get('requests_n', 0)} requests, {c.get('foreign_n', 0)} replies with another id"
                 cause = f"no valid status packet for {silent_s:.2f} s ({seen})"
                 raise DeviceTimeoutError(e.where, cause, e.remedy) from e
@@ -518,12 +470,3 @@ class Ph54Rotator:
             detail = f"a goal was refused: {error.cause}"
             self._observer.faults.event("ram_reset", detail, self._clock.now_s())
         await self._make_safe(device)
-
-
-def _condition(error: DeviceError) -> str:
-    """The fault's name for an error that ended the connection."""
-    if isinstance(error, WrongDeviceError):
-        return "wrong_device"
-    if isinstance(error, DeviceMissingError | DeviceLostError):
-        return "unplugged"
-    return "no_reply"
