@@ -85,6 +85,7 @@ class Ph54Rotator:
         self._wake = asyncio.Event()
         self._readers: list[asyncio.Future[None]] = []
         self._torque_is_ours = False
+        self._powering_down = False
 
     # -- what it is -------------------------------------------------------------------------------------------
 
@@ -125,6 +126,7 @@ class Ph54Rotator:
         self._require(Lifecycle.CLOSED)
         self._observer.faults.clear(*_LINK_FAULTS)
         self._torque_is_ours = False
+        self._command.forget()
         try:
             await self._connect()
         except BaseException as e:
@@ -204,6 +206,13 @@ class Ph54Rotator:
 
     async def _power_down(self, *, off: bool, leaving: bool = False) -> None:
         """Hold, wait for rest, then torque off where asked; leaving with torque on, the watchdog is taken off duty."""
+        self._powering_down = True
+        try:
+            await self._power_down_in_turn(off=off, leaving=leaving)
+        finally:
+            self._powering_down = False
+
+    async def _power_down_in_turn(self, *, off: bool, leaving: bool) -> None:
         async with self._turn:
             device = self._link.device
             self._command.hold()
@@ -409,7 +418,10 @@ class Ph54Rotator:
             await self._end_active(device, "ram_reset", detail)
 
     async def _protect(self, device: Ph54Device) -> None:
-        """End ACTIVE where torque is gone, the watchdog has tripped or turns were lost. Only arm() brings it back."""
+        """End ACTIVE where torque is gone, the watchdog has tripped or turns were lost. Only arm() brings it back.
+
+        In STANDBY finish what an interrupted disarm left: torque of ours that should be off, a trip to be cleared.
+        """
         observer = self._observer
         if self._lifecycle is Lifecycle.ACTIVE:
             if not observer.torque_on:
@@ -417,7 +429,10 @@ class Ph54Rotator:
                 observer.name_torque_loss(await observer.read_goals(device, attempts_n=PATIENT_N))
             elif observer.tripped or observer.turns_jumped:
                 await self._end_active(device)
-        elif observer.tripped and not observer.torque_on:
+        elif not self._powering_down and (
+            (self._torque_is_ours and observer.torque_on and self.settings.torque_at_disarm == "off")
+            or (observer.tripped and not observer.torque_on)
+        ):
             await self._make_safe(device)
 
     async def _end_active(self, device: Ph54Device, condition: str = "", detail: str = "") -> None:
