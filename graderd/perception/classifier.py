@@ -12,6 +12,7 @@ import numpy as np
 from graderd.core.blade import BladeGeometry
 from graderd.core.zones import PictureFault, SoilObservation, Zone
 from graderd.hal.camera import Frame, Intrinsics
+from graderd.hal.settings import CameraSettings
 from graderd.perception import annotate as drawing
 from graderd.perception.color import fast_color_verdict, paper_verdict
 from graderd.perception.decide import Verdict
@@ -58,12 +59,13 @@ class SoilClassifier:
         blade: BladeGeometry,
         live: bool = True,
         mounting: Mounting = "facing_blade_from_front",
+        camera: CameraSettings | None = None,
     ) -> None:
         self._settings = settings
         self._calibration = calibration
         self._mounting = calibration.mounting if calibration is not None else mounting
         self._blade = blade
-        self._health = HealthMonitor(settings.health, live)
+        self._health = HealthMonitor(settings.health, live, camera)
         self._views: dict[tuple[str, Intrinsics], View] = {}
         self._judges: dict[Intrinsics, DepthJudge] = {}
         self._regions: OrderedDict[tuple[object, ...], _Regions | None] = OrderedDict()
@@ -231,10 +233,12 @@ def make_classifier(
     blade: BladeGeometry,
     live: bool = True,
     mounting: Mounting = "facing_blade_from_front",
+    camera: CameraSettings | None = None,
 ) -> Classifier:
     """A classifier for one stream of frames.
 
     ``calibration`` None: thirds of the whole picture (colour methods only), left and right after ``mounting``.
-    ``live`` False: the frames are stills, so equal pictures and changing sizes are no fault.
+    ``live`` False: the frames are stills, so equal pictures and changing sizes are no fault. ``camera``: what was asked
+    of it; a colour picture of another size is then a fault.
     """
-    return SoilClassifier(settings, calibration, blade, live, mounting)
+    return SoilClassifier(settings, calibration, blade, live, mounting, camera)

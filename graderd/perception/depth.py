@@ -89,6 +89,8 @@ class DepthJudge:
         s, d, z = s[near], d[near], z[near]
         setback = self._finder.setback(z)
         fix = self._finder.find(s, d, z, setback)
+        if fix.seen == 0:
+            fix = self._finder.displaced(depth_mm, angle_deg)
         # Small rotation and shift of the blade against its calibrated place.
         turn = np.float32(np.radians(fix.turn_deg))
         ahead, along = np.float32(fix.ahead_m), np.float32(fix.along_m)

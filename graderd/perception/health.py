@@ -12,7 +12,8 @@ import numpy as np
 
 from graderd.core.zones import PictureFault
 from graderd.hal.camera import Frame
-from graderd.perception.geometry import U8, Region
+from graderd.hal.settings import CameraSettings
+from graderd.perception.geometry import F32, U8, Region
 from graderd.perception.registration import BladeFix, Ground
 from graderd.perception.settings import DepthSettings, HealthSettings
 
@@ -23,6 +24,8 @@ FLAT_GRAY = 1.6
 """Standard deviation (grey levels) within a tile of the smoothed sample below which it shows nothing."""
 CLIPPED_GRAY = 250
 BLUR_ROWS_N = 12
+BLUR_MIN_CONTRAST = 64.0
+"""Square grey levels of four summed pixels."""
 GROUND_AT_M = (0.2, 0.0)
 """Where the ground's level is compared: before the blade."""
 
@@ -30,8 +33,9 @@ GROUND_AT_M = (0.2, 0.0)
 class HealthMonitor:
     """Judges pictures one after the other; one instance per stream of frames."""
 
-    def __init__(self, settings: HealthSettings, live: bool) -> None:
+    def __init__(self, settings: HealthSettings, live: bool, camera: CameraSettings | None = None) -> None:
         self._settings = settings
+        self._asked = (camera.color_width_px, camera.color_height_px) if camera is not None else None
         self._live = live
         self._last_sample: bytes = b""
         self._last_size: tuple[int, ...] = ()
@@ -64,6 +68,9 @@ class HealthMonitor:
             if lens is not None and shape and (lens.width, lens.height) != shape:
                 detail = f"{what} picture is {shape[0]}x{shape[1]}, its lens data are for {lens.width}x{lens.height}"
                 faults.append(PictureFault("wrong_resolution", detail))
+        if self._asked is not None and (width, height) != self._asked and not faults:
+            detail = f"colour picture is {width}x{height}, {self._asked[0]}x{self._asked[1]} was asked for"
+            faults.append(PictureFault("wrong_resolution", detail))
         if changed and not faults:
             before = "x".join(str(side) for side in self._last_size[:2])
             detail = f"colour picture is {width}x{height}, the stream began with {before}"
@@ -158,25 +165,31 @@ def flat_share(gray: U8) -> float:
 
 
 def sharpness_ratio(image_bgr: U8, region: Region) -> float:
-    """Mean difference of pixels 2 apart over that of pixels 16 apart, along sampled rows of the region, green channel.
+    """How much of the contrast along a row comes within a few pixels: 0.05 for a ramp, 0.15 to 0.8 for a sharp picture.
 
-    Four rows and two columns are averaged first, which takes out most of the sensor's noise. A sharp picture of soil
-    has about 0.25 to 0.5, a linear ramp 0.125. The sharper rows count (their 70th percentile): a picture is blurred
-    where all of it is. Distances are those of a picture 1280 across; larger ones are measured as coarsely.
+    With E(k) the mean square difference of pixels k apart, it is (E(4) - E(2)) / (E(16) - E(4)): the sensor's noise
+    adds the same to every E and falls out. Green channel, sums of four rows, sampled over the region; the sharper rows
+    count (their 70th percentile), because a picture is blurred where all of it is. Distances are those of a picture
+    1280 across; larger ones are measured as coarsely. 1 where there is no contrast to judge by.
     """
     unit = max(1, round(image_bgr.shape[1] / 1280))
     band = image_bgr[region.rows, region.columns, 1]
     step = max(4, band.shape[0] // BLUR_ROWS_N)
     usable = band.shape[0] // step * step
-    fine, coarse = 2 * unit, 16 * unit
-    if usable == 0 or band.shape[1] < 2 * coarse:
+    if usable == 0 or band.shape[1] < 32 * unit:
         return 1.0
-    rows = sum(band[row:usable:step].astype(np.float32) for row in range(4))
-    lines = np.asarray(rows)[:, unit:] + np.asarray(rows)[:, :-unit]
-    near = np.abs(lines[:, fine:] - lines[:, :-fine]).mean(axis=1)
-    far = np.abs(lines[:, coarse:] - lines[:, :-coarse]).mean(axis=1)
-    textured = far > 4.0
+    lines = band[:usable:step].astype(np.float32)
+    for row in range(1, 4):
+        lines += band[row:usable:step]
+    two, four, sixteen = (_square_difference(lines, distance * unit) for distance in (2, 4, 16))
+    textured = sixteen - four > BLUR_MIN_CONTRAST
     if not textured.any():
         return 1.0
-    ratios = np.sort(near[textured] / far[textured])
+    ratios = np.sort((four - two)[textured] / (sixteen - four)[textured])
     return float(ratios[ratios.size * 7 // 10])
+
+
+def _square_difference(lines: F32, distance: int) -> F32:
+    """Mean square difference of pixels ``distance`` apart, per row."""
+    difference = lines[:, distance:] - lines[:, :-distance]
+    return np.asarray(np.einsum("ij,ij->i", difference, difference) / difference.shape[1], dtype=np.float32)

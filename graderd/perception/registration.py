@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from graderd.core.blade import BladeGeometry
 from graderd.hal.camera import DepthImage
-from graderd.perception.geometry import F32, F64, View, face_setback_m, top_edge_m
+from graderd.perception.geometry import F32, F64, View, blade_points_m, face_setback_m, top_edge_m
 
 GROUND_CELL_M = 0.08
 GROUND_BAND_M = 0.13
@@ -33,6 +33,8 @@ FACE_POINTS_N = 2000
 TOP_COLUMNS_N = 24
 EDGE_ANGLE_STEP_DEG = 0.5
 KEPT_COLUMNS_N = 256
+BODY_BELOW_M = (0.05, 0.13)
+"""Heights below the upper edge at which the face is probed."""
 TOP_SEARCH_PX = 36
 """The upper edge is looked for so far above and below where it should be, at 848 pixels across."""
 SUNK_M = 0.025
@@ -145,8 +147,8 @@ class BladeFix:
     """Where the blade was found, relative to the calibrated place at the measured angle.
 
     ``ahead_m`` along d, ``along_m`` along s, ``turn_deg`` counter-clockwise; each 0 where it could not be seen.
-    ``seen``: share of the pixels on the calibrated face that show the face. ``missing``: share of them that see
-    through to what lies behind, where a blade should be.
+    ``seen``: share of the pixels on the calibrated face that show the face. ``missing``: share of places
+    on the face that show something else upright, or what lies behind, where the face should be.
     """
 
     ahead_m: float = 0.0
@@ -158,10 +160,15 @@ class BladeFix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _EdgeColumns:
-    """Pieces of picture columns across the blade's upper edge: flat pixel indices and their rays, columns x pixels."""
+    """Pieces of picture columns across the blade's upper edge: flat pixel indices and their rays, columns x pixels.
+
+    ``body``: two pixels on the face below the edge in each column, likewise.
+    """
 
     pixels: npt.NDArray[np.intp]
     rays: F32
+    body: npt.NDArray[np.intp]
+    body_rays: F32
 
 
 class BladeFinder:
@@ -216,6 +223,29 @@ class BladeFinder:
         tops = height[column[free], first[free]]
         return blade.bottom_z_m + blade.height_m - float(np.median(tops))
 
+    def displaced(self, depth_mm: DepthImage, angle_deg: float) -> BladeFix:
+        """What stands where the face should be, when :meth:`find` saw no face near: a face further off, or nothing.
+
+        Two pixels a little apart in height, down each column: on a face they are as far ahead as each other, on a
+        slope of soil they are not.
+        """
+        columns = self._edge_columns(round(angle_deg / EDGE_ANGLE_STEP_DEG))
+        if columns is None:
+            return BladeFix()
+        z_optical = depth_mm.ravel()[columns.body] * np.float32(0.001)
+        at = columns.body_rays * z_optical[..., None] + self._position
+        cos, sin = np.float32(np.cos(np.radians(angle_deg))), np.float32(np.sin(np.radians(angle_deg)))
+        d = at[..., 0] * cos + at[..., 1] * sin - np.float32(self._blade.x_offset_m)
+        face = d + self.setback(at[..., 2])
+        valid = (z_optical > 0).all(axis=1)
+        if valid.sum() < TOP_COLUMNS_N // 3:
+            return BladeFix()
+        face = face[valid]
+        upright = np.abs(face[:, 0] - face[:, 1]) < 0.03
+        through = face.max(axis=1) < -0.2
+        elsewhere = through | (upright & (np.abs(face[:, 0]) > self.SEARCH_M))
+        return BladeFix(missing=float(elsewhere.mean()))
+
     def _edge_columns(self, step: int) -> _EdgeColumns | None:
         """The pixels in which the upper edge is looked for at this angle; None where too few are in the picture."""
         if step in self._columns:
@@ -232,11 +262,24 @@ class BladeFinder:
             down = np.arange(-reach, reach + 1, stride)
             v = v[inside, None] + down[None, :]
             u = np.broadcast_to(u[inside, None], v.shape)
-            columns = _EdgeColumns(v * lens.width + u, self._all_rays[v, u])
+            columns = _EdgeColumns(v * lens.width + u, self._all_rays[v, u], *self._body(angle_deg))
         if len(self._columns) >= KEPT_COLUMNS_N:
             self._columns.clear()
         self._columns[step] = columns
         return columns
+
+    def _body(self, angle_deg: float) -> tuple[npt.NDArray[np.intp], F32]:
+        lens, blade = self._view.lens, self._blade
+        s = np.linspace(-0.45, 0.45, TOP_COLUMNS_N) * blade.length_m
+        places = []
+        for below_m in BODY_BELOW_M:
+            z = np.full(TOP_COLUMNS_N, blade.bottom_z_m + blade.height_m - below_m)
+            places.append(self._view.project(blade_points_m(blade, angle_deg, s, -face_setback_m(blade, z), z)))
+        both = np.round(np.stack(places, axis=1))
+        seen = np.isfinite(both).all(axis=(1, 2)) & (both >= 0).all(axis=(1, 2))
+        seen &= (both[..., 0] < lens.width).all(axis=1) & (both[..., 1] < lens.height).all(axis=1)
+        u, v = both[seen].astype(np.intp).transpose(2, 0, 1)
+        return v * lens.width + u, self._all_rays[v, u]
 
     def find(self, s: F32, d: F32, z: F32, setback: F32) -> BladeFix:
         """``s, d, z``: points in blade coordinates, level ground at z = 0; ``setback`` that of their heights."""
@@ -259,7 +302,7 @@ class BladeFinder:
                 at.append((i + 0.5) / self.COLUMNS_N * blade.length_m - half)
                 middle = inside.size * 7 // 20
                 medians.append(float(np.partition(inside, middle)[middle]))
-        if len(at) < 4:
+        if len(at) < self.COLUMNS_N // 2:
             return BladeFix()
         s_at, face_at = np.asarray(at), np.asarray(medians)
         first, second = np.triu_indices(len(at), 3)

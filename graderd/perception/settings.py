@@ -127,7 +127,7 @@ class HealthSettings(Settings):
     blocked_flat_percent: Percent = Field(default=70.0, description="share of the picture without any texture: blocked")
     frozen_frames_n: int = Field(default=3, ge=0, description="so many identical pictures in a row: frozen; 0: never")
     blurred_ratio: NotNegative = Field(
-        default=0.2, description="fine over coarse contrast below which a picture is blurred"
+        default=0.11, description="fine over coarse contrast below which a picture is blurred"
     )
     torn_s: Positive = Field(default=0.02, description="colour and depth taken further apart than this: torn")
     knocked_mm: Positive = Field(

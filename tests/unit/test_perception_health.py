@@ -1,0 +1,156 @@
+"""Every fault of the picture is named, and none becomes a zone."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from graderd.core.blade import BladeGeometry
+from graderd.core.zones import SoilObservation, Zone
+from graderd.hal.camera import Frame
+from graderd.hal.settings import CameraSettings
+from graderd.perception import METHODS, CameraCalibration, Method, PerceptionSettings, make_classifier
+from tests.perception_scenes import PoseError, Scene, render
+
+ANGLE_DEG = 10.0
+
+
+@functools.cache
+def picture(pose: PoseError | None = None, number: int = 5, zone: Zone = Zone.LEFT) -> Frame:
+    scene = Scene(zone=zone, angle_deg=ANGLE_DEG, seed=number, pose=pose or PoseError())
+    return render(scene, color_size=(480, 300), depth_size=(424, 240), number=number)
+
+
+def judge(frame: Frame, method: Method = "fused", **more: Any) -> SoilObservation:
+    classifier = make_classifier(PerceptionSettings(method=method), CameraCalibration(), BladeGeometry(), **more)
+    return classifier.classify(frame, ANGLE_DEG, 0.01)
+
+
+def named(observation: SoilObservation) -> list[str]:
+    if observation.faults:
+        assert observation.zone is Zone.UNKNOWN
+        assert observation.confidence == 0.0
+    return [fault.condition for fault in observation.faults]
+
+
+def spoiled(frame: Frame, how: str) -> Frame:
+    color = frame.color_bgr
+    rng = np.random.default_rng(4)
+    if how == "black":
+        return replace(frame, color_bgr=(color // 64).astype(np.uint8))
+    if how == "blown_out":
+        return replace(frame, color_bgr=np.maximum(color, 252).astype(np.uint8))
+    if how == "blocked":
+        cover = np.full_like(color, (26, 32, 40)) + rng.integers(0, 4, color.shape, dtype=np.uint8)
+        return replace(frame, color_bgr=cover)
+    if how == "blurred":
+        soft = cv2.GaussianBlur(color, (0, 0), 6).astype(np.float64) + rng.normal(0, 2, color.shape)
+        return replace(frame, color_bgr=np.clip(soft, 0, 255).astype(np.uint8))
+    if how == "torn":
+        return replace(frame, depth_number=frame.color_number - 3)
+    if how == "wrong_resolution":
+        return replace(frame, color_bgr=np.ascontiguousarray(color[::2, ::2]))
+    assert frame.depth_mm is not None
+    if how == "no depth":
+        return replace(frame, depth_mm=None, depth_intrinsics=None, depth_number=-1)
+    return replace(
+        frame, depth_mm=np.where(rng.random(frame.depth_mm.shape) < 0.8, 0, frame.depth_mm).astype(np.uint16)
+    )
+
+
+def test_a_healthy_picture_has_no_fault() -> None:
+    observation = judge(picture())
+    assert named(observation) == []
+    assert observation.zone is Zone.LEFT
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("how", ["black", "blown_out", "blocked", "blurred", "torn", "wrong_resolution"])
+def test_faults_of_the_picture(how: str, method: Method) -> None:
+    assert named(judge(spoiled(picture(), how), method)) == [how]
+
+
+@pytest.mark.parametrize("how", ["no depth", "hardly any depth"])
+@pytest.mark.parametrize("method", ["depth", "fused"])
+def test_missing_depth_is_a_fault_where_depth_decides(how: str, method: Method) -> None:
+    assert named(judge(spoiled(picture(), how), method)) == ["depth_missing"]
+    assert named(judge(spoiled(picture(), how), "fast_color")) == []
+
+
+def test_torn_by_device_times() -> None:
+    frame = picture()
+    metadata = {"color_device_s": 1.0, "depth_device_s": 1.034}
+    assert named(judge(replace(frame, metadata=metadata))) == ["torn"]
+    # Counters of two sensors need not agree where their clocks do.
+    together = {"color_device_s": 1.0, "depth_device_s": 1.004}
+    assert named(judge(replace(frame, metadata=together, depth_number=77))) == []
+
+
+def test_the_same_picture_again_and_again_is_frozen_under_any_number() -> None:
+    classifier = make_classifier(PerceptionSettings(), CameraCalibration(), BladeGeometry())
+    frame = picture()
+    seen = [
+        named(classifier.classify(replace(frame, color_number=n, depth_number=n), ANGLE_DEG, 0.0)) for n in range(1, 7)
+    ]
+    assert seen[:3] == [[], [], []]
+    assert seen[3:] == [["frozen"]] * 3
+    assert named(classifier.classify(picture(number=9), ANGLE_DEG, 0.0)) == []  # clears when gone
+
+
+def test_equal_stills_are_not_frozen() -> None:
+    classifier = make_classifier(PerceptionSettings(), CameraCalibration(), BladeGeometry(), live=False)
+    frame = picture()
+    assert all(named(classifier.classify(frame, ANGLE_DEG, 0.0)) == [] for _ in range(6))
+
+
+def test_another_size_than_asked_for() -> None:
+    asked = CameraSettings(color_width_px=1280, color_height_px=800)
+    assert named(judge(picture(), camera=asked)) == ["wrong_resolution"]
+
+
+def test_a_size_that_changes_in_mid_stream() -> None:
+    classifier = make_classifier(PerceptionSettings(method="fast_color"), None, BladeGeometry())
+    one = np.random.default_rng(1).integers(0, 255, (400, 640, 3), dtype=np.uint8)
+    frames = [Frame(one, None, None, None, 0.0), Frame(np.ascontiguousarray(one[::2, ::2]), None, None, None, 0.1)]
+    assert [named(classifier.classify(frame, 0.0, 0.0)) for frame in frames] == [[], ["wrong_resolution"]]
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        PoseError(pitch_deg=5.0),
+        PoseError(pitch_deg=-5.0),
+        PoseError(roll_deg=5.0),
+        PoseError(yaw_deg=6.0),
+        PoseError(z_m=0.08),
+        PoseError(x_m=0.12),
+        PoseError(y_m=0.12),
+        PoseError(yaw_deg=25.0),
+        PoseError(x_m=0.02, y_m=0.03, pitch_deg=-4.0, yaw_deg=-3.0, roll_deg=2.0),
+    ],
+)
+def test_a_knocked_camera(pose: PoseError) -> None:
+    assert named(judge(picture(pose))) == ["knocked"]
+
+
+@pytest.mark.parametrize("zone", [Zone.NONE, Zone.CENTER])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_mount_that_gives_a_little_is_not_knocked(zone: Zone, sign: int) -> None:
+    pose = PoseError(sign * 0.02, -sign * 0.02, sign * 0.02, sign * 2.0, sign * 2.0, -sign * 2.0)
+    observation = judge(picture(pose, zone=zone))
+    assert named(observation) == []
+    assert observation.zone is zone
+
+
+def test_an_old_blade_angle_is_unknown_without_a_fault_of_the_picture() -> None:
+    classifier = make_classifier(PerceptionSettings(), CameraCalibration(), BladeGeometry())
+    observation = classifier.classify(picture(), ANGLE_DEG, 0.6)
+    assert observation.zone is Zone.UNKNOWN
+    assert observation.faults == ()
+    assert "0.60 s old" in observation.reason
+    assert observation.blade_angle_age_s == 0.6
