@@ -8,10 +8,14 @@ differs from it by up to 2 cm and 2 degrees, as the manifest says.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import csv
 import json
+import multiprocessing
 import sys
 import time
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +27,7 @@ from drivers.rig.materials import Materials
 from drivers.rig.optics import COLOR_INTRINSICS, DEPTH_INTRINSICS, camera_json, knocked
 from drivers.rig.renderer import Renderer
 from drivers.rig.scenes import RandomScene, random_scene
+from graderd.hal.camera import ColorImage, DepthImage
 
 COLUMNS = ("id", "label", "blade_angle_deg", "vol_left_l", "vol_center_l", "vol_right_l")
 EXTRA_COLUMNS = (
@@ -55,8 +60,58 @@ EXTRA_COLUMNS = (
     "turn_y_deg",
     "turn_z_deg",
 )
+_TEXTURE_VARIANTS = 4
 _ANGLE_ERROR_DEG = 0.2
 """Standard deviation of the blade angle given with a frame: what a servo's reading is off by."""
+
+
+class _Studio:
+    """Makes the frames of one set, any of them in any order: a frame depends on the seed and its number alone."""
+
+    def __init__(
+        self,
+        out: Path,
+        digits: int,
+        seed: int,
+        color_format: str,
+        color_size: tuple[int, int],
+        depth_size: tuple[int, int],
+    ) -> None:
+        self._out = out
+        self._digits = digits
+        self._seed = seed
+        self._color_format = color_format
+        self._color_size = color_size
+        self._depth_size = depth_size
+        self._materials: dict[int, Materials] = {}
+
+    def make(self, number: int) -> dict[str, Any]:
+        """Write frame ``number``; returns its line of the manifest."""
+        scene = random_scene(self._seed, number)
+        color, depth = self._photograph(scene, number)
+        name = f"{number:0{self._digits}d}"
+        _write(self._out / f"{name}.color.{self._color_format}", color)
+        _write(self._out / f"{name}.depth.png", depth)
+        return _row(name, scene, (self._seed, number))
+
+    def _photograph(self, scene: RandomScene, number: int) -> tuple[ColorImage, DepthImage]:
+        variant = number % _TEXTURE_VARIANTS
+        if variant not in self._materials:
+            self._materials[variant] = Materials(self._seed + variant)
+        color_pose, depth_pose = knocked(scene.shift_m, scene.turn_deg)
+        renderer = Renderer(
+            self._color_size,
+            self._depth_size,
+            seed=int(np.random.default_rng((self._seed, number, 1)).integers(2**31)),
+            color_pose=color_pose,
+            depth_pose=depth_pose,
+            materials=self._materials[variant],
+        )
+        heights_m = scene.field.heights_m.astype(np.float32)
+        state = SceneState(heights_m, scene.field.cell_m, scene.vehicle_x_m, scene.blade, scene.props)
+        color, depth = renderer.render(state, scene.look)
+        assert depth is not None
+        return color, depth
 
 
 def export(
@@ -67,11 +122,13 @@ def export(
     color_format: str = "jpg",
     color_size: tuple[int, int] = (1280, 800),
     depth_size: tuple[int, int] = (848, 480),
+    jobs: int = 1,
     progress: bool = True,
 ) -> None:
     """Write ``scenes`` random scenes of ``seed`` as a frame set into ``out`` (made if missing).
 
-    A run that is stopped leaves a valid, shorter set: the manifest's line is written after the frame's pictures.
+    ``jobs`` processes share the work; the frames do not depend on how many. A run that is stopped leaves a valid,
+    shorter set: the manifest's line is written after the frame's pictures.
 
     Raises:
         FileExistsError: ``out`` holds a frame set already.
@@ -83,44 +140,39 @@ def export(
         raise FileExistsError(f"{out} holds a frame set already; choose another folder or remove it")
     color_lens, depth_lens = COLOR_INTRINSICS.scaled(*color_size), DEPTH_INTRINSICS.scaled(*depth_size)
     (out / "camera.json").write_text(json.dumps(camera_json(color_lens, depth_lens), indent=1) + "\n", encoding="utf-8")
-    digits = max(3, len(str(scenes - 1)))
+    studio = _Studio(out, max(3, len(str(scenes - 1))), seed, color_format, color_size, depth_size)
     start_s = time.monotonic()
-    materials = [Materials(seed + variant) for variant in range(4)]
-    with manifest_path.open("w", newline="", encoding="utf-8") as file:
+    with manifest_path.open("w", newline="", encoding="utf-8") as file, contextlib.ExitStack() as stack:
         manifest = csv.DictWriter(file, [*COLUMNS, *EXTRA_COLUMNS])
         manifest.writeheader()
-        for number in range(scenes):
-            scene = random_scene(seed, number)
-            color, depth = _photograph(scene, materials[number % 4], (seed, number), color_size, depth_size)
-            name = f"{number:0{digits}d}"
-            _write(out / f"{name}.color.{color_format}", color)
-            _write(out / f"{name}.depth.png", depth)
-            manifest.writerow(_row(name, scene, (seed, number)))
+        rows: Iterable[dict[str, Any]] = map(studio.make, range(scenes))
+        if jobs > 1:
+            context = multiprocessing.get_context("spawn")
+            pool = ProcessPoolExecutor(jobs, context, initializer=_enter, initargs=(studio,))
+            stack.callback(pool.shutdown, cancel_futures=True)
+            rows = pool.map(_make, range(scenes))
+        for done, row in enumerate(rows, start=1):
+            manifest.writerow(row)
             file.flush()
             if progress:
-                _show(number + 1, scenes, time.monotonic() - start_s)
+                _show(done, scenes, time.monotonic() - start_s)
     if progress:
         sys.stderr.write("\n")
 
 
-def _photograph(
-    scene: RandomScene,
-    materials: Materials,
-    seeds: tuple[int, int],
-    color_size: tuple[int, int],
-    depth_size: tuple[int, int],
-) -> tuple[np.ndarray, np.ndarray]:
-    color_pose, depth_pose = knocked(scene.shift_m, scene.turn_deg)
-    noise_seed = int(np.random.default_rng((*seeds, 1)).integers(2**31))
-    renderer = Renderer(
-        color_size, depth_size, seed=noise_seed, color_pose=color_pose, depth_pose=depth_pose, materials=materials
-    )
-    state = SceneState(
-        scene.field.heights_m.astype(np.float32), scene.field.cell_m, scene.vehicle_x_m, scene.blade, scene.props
-    )
-    color, depth = renderer.render(state, scene.look)
-    assert depth is not None
-    return color, depth
+_studio: _Studio | None = None
+"""In a worker process: the studio it works in, so that its textures are made once."""
+
+
+def _enter(studio: _Studio) -> None:
+    global _studio  # a pool's initializer has no other place to leave what its workers need
+    cv2.setNumThreads(1)
+    _studio = studio
+
+
+def _make(number: int) -> dict[str, Any]:
+    assert _studio is not None
+    return _studio.make(number)
 
 
 def _row(name: str, scene: RandomScene, seeds: tuple[int, int]) -> dict[str, Any]:
@@ -183,13 +235,21 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--scenes", type=int, default=300, help="how many (default 300)")
     parser.add_argument("--seed", type=int, default=0, help="which set; the same seed gives the same frames")
     parser.add_argument("--format", choices=("jpg", "png"), default="jpg", help="of the colour pictures (default jpg)")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that share the work (default 1)")
     parser.add_argument("--quiet", action="store_true", help="show no progress")
     options = parser.parse_args(arguments)
-    if options.scenes < 1 or options.seed < 0:
-        parser.error("--scenes must be at least 1 and --seed not negative")
+    if options.scenes < 1 or options.seed < 0 or options.jobs < 1:
+        parser.error("--scenes and --jobs must be at least 1 and --seed not negative")
     cv2.setNumThreads(1)
     try:
-        export(options.out, options.scenes, options.seed, color_format=options.format, progress=not options.quiet)
+        export(
+            options.out,
+            options.scenes,
+            options.seed,
+            color_format=options.format,
+            jobs=options.jobs,
+            progress=not options.quiet,
+        )
     except OSError as error:
         sys.stderr.write(f"dataset: {error}\n")
         return 1

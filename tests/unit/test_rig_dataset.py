@@ -171,6 +171,18 @@ def test_rig_set_is_not_overwritten_and_bad_arguments_are_refused(
     assert "at least 1" in result.stderr
 
 
+def test_rig_set_does_not_depend_on_how_many_processes_made_it(tmp_path: Path) -> None:
+    for jobs in (1, 2):
+        dataset.export(
+            tmp_path / f"{jobs}", 3, 8, color_size=(320, 200), depth_size=(424, 240), jobs=jobs, progress=False
+        )
+    files = sorted(path.name for path in (tmp_path / "1").iterdir())
+    assert len(files) == 8
+    assert files == sorted(path.name for path in (tmp_path / "2").iterdir())
+    for name in files:
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes(), name
+
+
 def test_rig_set_shows_its_progress(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     dataset.export(tmp_path / "set", 1, 1, color_size=(320, 200), depth_size=(424, 240), color_format="png")
     assert "1/1 scenes" in capsys.readouterr().err
