@@ -229,7 +229,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m drivers.rig.dataset",
         description="Write a labelled frame set of random scenes: soil, light, blade, camera pose, noise, occluders.",
-        epilog="Example: python -m drivers.rig.dataset --out /tmp/set --scenes 300 --seed 42",
+        epilog="Example: python -m drivers.rig.dataset --out frames --scenes 300 --seed 42",
     )
     parser.add_argument("--out", type=Path, required=True, help="folder to write (must not hold a set yet)")
     parser.add_argument("--scenes", type=int, default=300, help="how many (default 300)")
