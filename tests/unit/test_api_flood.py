@@ -31,6 +31,9 @@ async def test_the_tick_goes_on_and_stop_gets_through(
     tmp_path: Path, kind: str, connections_n: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with serving(tmp_path) as (daemon, path):
+        await daemon.until(lambda: len(daemon.late_s) > 40)
+        # How late ticks come before the flood: this machine may be busy with other things.
+        quiet_s = sorted(daemon.late_s)[36]
         flood = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "tests.unit.api_flood", str(path), str(FLOOD_S), kind, str(connections_n)),
             stdout=asyncio.subprocess.PIPE,
@@ -40,7 +43,7 @@ async def test_the_tick_goes_on_and_stop_gets_through(
         stop = await asyncio.create_subprocess_exec(
             *command_line(path, "stop", "--reason", "flooded"), stdout=asyncio.subprocess.DEVNULL
         )
-        await daemon.until(lambda: daemon.state.mode is Mode.STOPPED, timeout_s=10)
+        await daemon.until(lambda: daemon.state.mode is Mode.STOPPED, timeout_s=20)
         tasks_n = len(asyncio.all_tasks())
         assert await within(20, stop.wait()) == 0
         assert flood.stdout is not None
@@ -51,9 +54,9 @@ async def test_the_tick_goes_on_and_stop_gets_through(
     assert counts["sent"] > 300
     if kind == "ask":
         assert counts["503"] > 0
-    # This machine may be busy with other things; without the limits the median itself is beyond a tick.
-    assert late_s[len(late_s) // 2] < TICK_S / 2
-    assert late_s[int(len(late_s) * 0.9)] < 3 * TICK_S
+    # Without the limits the median itself is about a tick and more.
+    assert late_s[len(late_s) // 2] < TICK_S / 2 + quiet_s
+    assert late_s[int(len(late_s) * 0.9)] < 3 * TICK_S + 2 * quiet_s
     limits = ApiLimits()
     assert tasks_n < 3 * limits.connections_max_n
     assert [record for record in caplog.records if record.levelname in ("ERROR", "CRITICAL")] == []
