@@ -269,14 +269,14 @@ def _arm(
     if inputs.devices_active:
         # Arming writes and reads back limits and watchdogs; devices left active from before must not skip that.
         return no("the devices are still being released", "arm again in a moment")
-    fault = worst(inputs.faults)
-    if fault is not None and fault.row.reaction >= Reaction.DISARM:
-        return no(f"{fault.name}: {fault.row.reads}", fault.row.remedy)
     if inputs.unmet:
         return no(
             "not ready: " + "; ".join(f"{u.name}: {u.reason}" for u in inputs.unmet),
             "; ".join(dict.fromkeys(u.remedy for u in inputs.unmet if u.remedy)),
         )
+    fault = worst(inputs.faults)
+    if fault is not None and fault.row.reaction >= Reaction.DISARM:
+        return no(f"{fault.name}: {fault.row.reads}", fault.row.remedy)
     return yes(replace(state, arming_since_s=inputs.now_s, reason="arming"), "arming")
 
 

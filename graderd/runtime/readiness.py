@@ -76,6 +76,8 @@ def _connected(loop: ControlLoop, name: str) -> Requirement:
     why = loop.connection_problems.get(name) or next(
         (f.detail for f in loop.faults.active if f.name.startswith(f"{name}.")), ""
     )
+    if not why and name != "rotation":
+        why = loop.connection_problems.get("can", "")
     return Requirement(
         name, False, True, f"{lifecycle}{': ' + why if why else ''}", f"check power, cable and the [{name}] section"
     )

@@ -132,7 +132,8 @@ async def test_without_any_device_it_says_what_is_missing_and_refuses_to_arm(tmp
         _, said = await arm.communicate()
         assert arm.returncode == 1
         assert b"rotation" in said
-        assert b"lift_left" in said
+        assert b"lift_left: closed" in said
+        assert b"no-can" in said
     finally:
         daemon.terminate()
         _, log = await daemon.communicate()
