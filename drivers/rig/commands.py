@@ -105,11 +105,19 @@ class ActuatorFault(_Command):
     params: Params = {}
 
 
+class StopLoopState(_Command):
+    """The stop loop: ``closed`` permits, ``open`` is a pressed button, ``shorted`` reads closed whatever happens,
+    ``silent`` does not answer, ``gone`` is a pulled plug."""
+
+    cmd: Literal["stop_loop"]
+    state: Literal["closed", "open", "shorted", "silent", "gone"]
+
+
 class ClearFaults(_Command):
     """End faults: of one part, or all."""
 
     cmd: Literal["clear_faults"]
-    part: Literal["camera", "servo", "actuators"] | None = None
+    part: Literal["camera", "servo", "actuators", "stop_loop"] | None = None
 
 
 class Faults(_Command):
@@ -154,6 +162,7 @@ Command = Annotated[
     | CameraFault
     | ServoFault
     | ActuatorFault
+    | StopLoopState
     | ClearFaults
     | Faults
     | State

@@ -21,6 +21,7 @@ from drivers.rig.piles import heap
 from drivers.rig.soil import FloatArray, SoilField
 from drivers.rig.topview import CAMERA_HEIGHT_M, top_depth, top_view
 from drivers.rig.world import scene_heights
+from drivers.stop_input import StopLoop
 from graderd.hal.errors import DeviceError
 
 MAX_LINE = 1 << 16
@@ -29,9 +30,12 @@ MAX_LINE = 1 << 16
 class Desk:
     """Serves the control socket of one rig. ``quit_rig``: called when a client asks the rig to end."""
 
-    def __init__(self, machine: Machine, camera: CameraChild, quit_rig: Callable[[], None]) -> None:
+    def __init__(
+        self, machine: Machine, camera: CameraChild, stop_loop: StopLoop, quit_rig: Callable[[], None]
+    ) -> None:
         self._machine = machine
         self._camera = camera
+        self._stop_loop = stop_loop
         self._quit = quit_rig
         self._look = Look()
         self._camera_faults: dict[str, dict[str, float]] = {}
@@ -117,6 +121,8 @@ class Desk:
                 machine.inject_servo_fault(command.name, command.params)
             case commands.ActuatorFault():
                 machine.inject_actuator_fault(command.name, command.device, command.params)
+            case commands.StopLoopState():
+                await self._stop_loop.become(command.state)
             case commands.ClearFaults():
                 await self._clear_faults(command.part)
             case commands.Faults():
@@ -159,6 +165,8 @@ class Desk:
             self._machine.clear_servo_faults()
         if part in (None, "actuators"):
             self._machine.clear_actuator_faults()
+        if part in (None, "stop_loop"):
+            await self._stop_loop.become("closed")
 
 
 def _explain(error: ValidationError) -> str:

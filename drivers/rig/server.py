@@ -17,6 +17,7 @@ from drivers.rig.camera_child import CameraChild
 from drivers.rig.desk import MAX_LINE, Desk
 from drivers.rig.machine import Machine
 from drivers.rig.shared import SharedScene
+from drivers.stop_input import StopLoop
 from graderd.hal.errors import DeviceMissingError
 
 _TICK_S = 0.01
@@ -49,6 +50,11 @@ class RigPaths:
         return self.directory / "control.sock"
 
     @property
+    def stop_input(self) -> Path:
+        """Unix socket of the stop loop."""
+        return self.directory / "stop.sock"
+
+    @property
     def ready(self) -> Path:
         """JSON file that appears when everything above is there."""
         return self.directory / "rig.json"
@@ -68,7 +74,8 @@ class Rig:
         heights_m = self.machine.world.field.heights_m
         self._scene = SharedScene.create((heights_m.shape[0], heights_m.shape[1]))
         self.camera = CameraChild(self._scene.descriptor, self.paths.camera, seed)
-        self._desk = Desk(self.machine, self.camera, self.stop)
+        self.stop_loop = StopLoop(self.paths.stop_input)
+        self._desk = Desk(self.machine, self.camera, self.stop_loop, self.stop)
         self._stop = asyncio.Event()
 
     # -- life -------------------------------------------------------------------------------------------------------
@@ -95,6 +102,8 @@ class Rig:
             await self.camera.start()
             stack.push_async_callback(self.machine.close)
             await self.machine.start()
+            stack.push_async_callback(self.stop_loop.close)
+            await self.stop_loop.start()
             server = await asyncio.start_unix_server(self._desk.serve, str(paths.control), limit=MAX_LINE)
             stack.push_async_callback(self._end_server, server)
             stack.callback(paths.ready.unlink, missing_ok=True)
@@ -143,6 +152,7 @@ class Rig:
             "can": where,
             "camera": str(self.paths.camera),
             "control": str(self.paths.control),
+            "stop_input": str(self.paths.stop_input),
         }
         partial = self.paths.ready.with_name(f".rig.json.{os.getpid()}")
         partial.write_text(json.dumps(content) + "\n", encoding="utf-8")

@@ -24,6 +24,7 @@ PARTS = {
     "can": "The CAN bus",
     "camera": "Camera and pictures",
     "daemon": "The daemon itself",
+    "stop_input": "The stop input",
 }
 REACTIONS = {
     Reaction.WARN: "It is told; everything goes on.",

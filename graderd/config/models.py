@@ -21,6 +21,7 @@ from graderd.hal.settings import (
     Positive,
     RotatorSettings,
     Settings,
+    StopInputSettings,
 )
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
 
@@ -120,6 +121,7 @@ class Config(Settings):
     api: ApiSettings = Field(default_factory=ApiSettings)
     recording: RecordingSettings = Field(default_factory=RecordingSettings)
     state: StateSettings = Field(default_factory=StateSettings)
+    stop_input: StopInputSettings = Field(default_factory=StopInputSettings)
     presets: dict[str, Preset] = Field(default_factory=_presets)
 
     @model_validator(mode="after")

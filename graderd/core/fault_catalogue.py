@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
-from graderd.core.fault_rows import actuator, camera, can, daemon, rotation
+from graderd.core.fault_rows import actuator, camera, can, daemon, rotation, stop_input
 from graderd.core.faults import ACTUATORS, FaultRow, catalogue_key
 
 
@@ -20,7 +20,7 @@ def _by_key(rows: Iterable[FaultRow]) -> Mapping[str, FaultRow]:
 
 
 CATALOGUE: Mapping[str, FaultRow] = _by_key(
-    (*rotation.ROWS, *actuator.ROWS, *can.ROWS, *camera.ROWS, *daemon.ROWS),
+    (*rotation.ROWS, *actuator.ROWS, *can.ROWS, *camera.ROWS, *daemon.ROWS, *stop_input.ROWS),
 )
 
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 class DeviceFault:
     """One present fault of one device.
 
-    ``device``: ``camera``, ``rotation``, ``lift_left``, ``lift_right``, ``tilt``, ``can``, ``servo_bus`` or ``daemon``.
+    ``device``: ``camera``, ``rotation``, ``lift_left``, ``lift_right``, ``tilt``, ``can``, ``servo_bus``,
+    ``stop_input`` or ``daemon``.
     ``condition``: the catalogue's name of the condition, for example ``no_reply``.
     ``detail``: one line with the numbers, for example ``no status packet for 0.21 s (7 requests)``.
     ``since_s``: monotonic time at which it was first seen.

@@ -106,6 +106,25 @@ class ActuatorSettings(Settings):
         return self
 
 
+class StopInputSettings(Settings):
+    """A normally closed loop whose opening stops the machine: buttons, gate switches, a contact of the safety relay."""
+
+    backend: Literal["none", "serial", "simulated"] = Field("none", description="serial: modem lines of a serial port")
+    port: str = Field("", description="serial port, or the simulated loop's socket")
+    drive: Literal["rts", "dtr"] = Field("rts", description="output that drives the loop")
+    line: Literal["cts", "dsr", "cd"] = Field("cts", description="input at the loop's end")
+    poll_hz: Positive = Field(100.0, ge=10, le=1000, description="looks at the loop a second")
+    open_samples_n: int = Field(2, ge=1, le=10, description="open in so many looks in a row: stop")
+    stale_s: Positive = Field(0.2, description="no look for so long: stop")
+    test_every_s: NotNegative = Field(10.0, description="test pulse that finds a short circuit; 0: none")
+
+    @model_validator(mode="after")
+    def _port(self) -> StopInputSettings:
+        if self.backend == "serial" and not self.port:
+            raise ValueError("backend serial needs a port")
+        return self
+
+
 class CameraSettings(Settings):
     """Where pictures come from and how the camera is set."""
 

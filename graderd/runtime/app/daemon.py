@@ -19,7 +19,7 @@ from graderd.core import commands as cmd
 from graderd.core.machine import Mode
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
-from graderd.runtime.app.devices import build_devices
+from graderd.runtime.app.devices import build_devices, build_stop_input
 from graderd.runtime.app.services import build_services
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
 from graderd.runtime.control import ControlLoop
@@ -92,12 +92,18 @@ class Daemon:
         self._recorder = Recorder(config)
         self._health = HealthWatch(config)
         self._loop.extra_faults += [self._recorder.faults, self._health.faults]
+        self._stop_input = build_stop_input(config, clock, on_stop=self._stop_from_input)
+        if self._stop_input is not None:
+            self._loop.extra_faults.append(self._stop_input.faults)
         self._loop.on_tick = self._after_tick
         self._status_line_due_s = 0.0
         self._ended = asyncio.Event()
 
     def _stop_from_bus(self, reason: str) -> None:
         self._loop.stop_now(cmd.Stop(reason=reason, client="can"))
+
+    def _stop_from_input(self, reason: str) -> None:
+        self._loop.stop_now(cmd.Stop(reason=reason, client="stop input"))
 
     def _after_tick(self) -> None:
         """Runs in the tick: nothing here may wait."""
@@ -125,6 +131,8 @@ class Daemon:
                     group.create_task(self._health.run(), name="health"),
                     group.create_task(self._recorder.run(), name="recorder"),
                 ]
+                if self._stop_input is not None:
+                    tasks.append(group.create_task(self._stop_input.run(), name="stop-input"))
                 if self._rig is not None:
                     tasks.append(group.create_task(self._rig.run(), name="rig"))
                 await answering.wait()

@@ -7,11 +7,13 @@ from collections.abc import Callable
 from drivers.dynamixel.ph54 import Ph54Rotator
 from drivers.electrak.actuator import ElectrakActuator
 from drivers.electrak.link import CanLink
+from drivers.stop_input import make_stop_input
 from graderd.config import Config
 from graderd.hal.clock import Clock
 from graderd.hal.fault import DeviceFault
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.runtime.devices import ACTUATOR_NAMES, Devices
+from graderd.runtime.stop_input import StopInputWatch
 
 
 def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], None]) -> Devices:
@@ -31,3 +33,9 @@ def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], Non
         actuators=actuators,
         publish_faults=publish,
     )
+
+
+def build_stop_input(config: Config, clock: Clock, on_stop: Callable[[str], None]) -> StopInputWatch | None:
+    """The watch over the stop input, or None where the configuration names none."""
+    source = make_stop_input(config.stop_input)
+    return None if source is None else StopInputWatch(config.stop_input, source, clock, on_stop)

@@ -112,4 +112,6 @@ def attach(config: Config, directory: Path) -> Config:
         "rotation": config.rotation.model_copy(update={"port": rig["servo"], "usb_serial_number": ""}),
         "can": config.can.model_copy(update=rig["can"]),
     }
+    if config.stop_input.backend == "simulated":
+        changes["stop_input"] = config.stop_input.model_copy(update={"port": rig["stop_input"]})
     return config.model_copy(update=changes)

@@ -1,0 +1,22 @@
+"""Stop inputs: the modem lines of a serial port, and the rig's."""
+
+from __future__ import annotations
+
+from drivers.stop_input.serial_line import SerialStopInput
+from drivers.stop_input.simulated import SimulatedStopInput, StopLoop
+from graderd.hal.settings import StopInputSettings
+from graderd.hal.stop_input import StopInput
+
+
+def make_stop_input(settings: StopInputSettings) -> StopInput | None:
+    """The input of these settings, not opened yet; None where there is none."""
+    match settings.backend:
+        case "serial":
+            return SerialStopInput(settings)
+        case "simulated":
+            return SimulatedStopInput(settings.port)
+        case "none":
+            return None
+
+
+__all__ = ["SerialStopInput", "SimulatedStopInput", "StopLoop", "make_stop_input"]

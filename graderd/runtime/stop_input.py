@@ -1,0 +1,111 @@
+"""Watches the stop input from a thread of its own: an open loop, a lost port and a silent one all mean stop.
+
+The thread may block in the port for as long as it likes: what counts for the control loop is the age of its last word.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from graderd.hal.clock import Clock
+from graderd.hal.errors import DeviceError
+from graderd.hal.fault import DeviceFault
+from graderd.hal.settings import StopInputSettings
+from graderd.hal.stop_input import StopInput
+
+DEVICE = "stop_input"
+RETRY_S = 0.5
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Word:
+    """What the thread found last: a condition (empty: the loop is closed) and when."""
+
+    condition: str
+    detail: str
+    time_s: float
+
+
+class StopInputWatch:
+    """One input, looked at ``poll_hz`` times a second. ``on_stop`` runs in the event loop, ahead of any tick."""
+
+    def __init__(
+        self, settings: StopInputSettings, source: StopInput, clock: Clock, on_stop: Callable[[str], None]
+    ) -> None:
+        self._settings = settings
+        self._source = source
+        self._clock = clock
+        self._on_stop = on_stop
+        self._ending = threading.Event()
+        self._word = _Word("lost", f"{source.where} was not read yet", clock.now_s())
+        self._since_s = clock.now_s()
+
+    def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
+        """Why operation is not permitted; empty while the loop is closed."""
+        word = self._word
+        age_s = now_s - word.time_s
+        if age_s > self._settings.stale_s and word.condition != "lost":
+            return (DeviceFault(DEVICE, "stale", f"{self._source.where}: no reading for {age_s:.2f} s", word.time_s),)
+        if word.condition:
+            return (DeviceFault(DEVICE, word.condition, word.detail, self._since_s),)
+        return ()
+
+    async def run(self) -> None:
+        """Watch until cancelled. The thread ends by itself, or with the process where its port never returns."""
+        loop = asyncio.get_running_loop()
+        threading.Thread(target=self._watch, args=(loop,), name="stop-input", daemon=True).start()
+        try:
+            await loop.create_future()
+        finally:
+            self._ending.set()
+
+    # ---- the thread --------------------------------------------------------------------------------------------------
+
+    def _watch(self, loop: asyncio.AbstractEventLoop) -> None:
+        while not self._ending.is_set():
+            try:
+                self._source.open()
+                log.info("stop input: %s", self._source.where)
+                self._look_on(loop)
+            except DeviceError as error:
+                self._say(loop, "lost", str(error))
+                self._ending.wait(RETRY_S)
+        self._source.close()
+
+    def _look_on(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Read, and now and then test, until told to end or until the port is lost."""
+        settings = self._settings
+        opens_n, stuck = 0, False
+        test_due_s = self._clock.now_s()
+        while not self._ending.is_set():
+            closed = self._source.is_closed()
+            if closed and settings.test_every_s and self._clock.now_s() >= test_due_s:
+                stuck = not self._source.follows()
+                test_due_s = self._clock.now_s() + settings.test_every_s
+            opens_n = 0 if closed else opens_n + 1
+            if opens_n >= settings.open_samples_n:
+                self._say(loop, "open", f"{self._source.where}: the loop is open")
+            elif closed and stuck:
+                self._say(loop, "stuck", f"{self._source.where}: reads closed though nothing drives the loop")
+            elif closed:
+                self._say(loop, "", "")
+            self._ending.wait(1.0 / settings.poll_hz)
+
+    def _say(self, loop: asyncio.AbstractEventLoop, condition: str, detail: str) -> None:
+        now_s = self._clock.now_s()
+        former, self._word = self._word, _Word(condition, detail, now_s)
+        if condition == former.condition:
+            return
+        self._since_s = now_s
+        if condition:
+            log.warning("stop input: %s", detail)
+            try:
+                loop.call_soon_threadsafe(self._on_stop, detail)
+            except RuntimeError:
+                return  # the event loop has ended, and everything with it

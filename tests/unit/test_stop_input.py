@@ -1,0 +1,254 @@
+"""The stop input: an open loop, a lost port, a silent one and a short circuit all mean stop."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from drivers.stop_input import SerialStopInput, SimulatedStopInput, StopLoop, make_stop_input
+from graderd.config import Config
+from graderd.core.fault_catalogue import CATALOGUE
+from graderd.core.faults import Clear, Reaction
+from graderd.hal.clock import SystemClock
+from graderd.hal.errors import DeviceLostError, DeviceMissingError
+from graderd.hal.settings import StopInputSettings
+from graderd.hal.stop_input import StopInput
+from graderd.runtime.stop_input import StopInputWatch
+
+DEADLINE_S = 5.0
+
+
+class FakePort:
+    """The modem lines of a serial port with a loop from RTS to CTS."""
+
+    def __init__(self) -> None:
+        self.rts = self.dtr = False
+        self.pressed = self.shorted = self.gone = False
+        self.closed_n = 0
+
+    @property
+    def cts(self) -> bool:
+        if self.gone:
+            raise OSError(5, "Input/output error")
+        return self.shorted or (self.rts and not self.pressed)
+
+    @property
+    def dsr(self) -> bool:
+        return False
+
+    @property
+    def cd(self) -> bool:
+        return self.dtr
+
+    def close(self) -> None:
+        self.closed_n += 1
+
+
+def serial_input(port: FakePort, **settings: object) -> SerialStopInput:
+    return SerialStopInput(
+        StopInputSettings(backend="serial", port="/dev/null", **settings),  # type: ignore[arg-type]  # as the model has them
+        open_port=lambda _: port,
+        sleep=lambda _: None,
+    )
+
+
+def test_the_serial_loop_reads_closed_only_while_driven_and_unbroken() -> None:
+    port = FakePort()
+    source = serial_input(port)
+    source.open()
+    assert port.rts
+    assert source.is_closed()
+    port.pressed = True
+    assert not source.is_closed()
+    port.pressed = False
+    assert source.is_closed()
+
+
+def test_a_test_pulse_finds_a_short_circuit_and_leaves_the_loop_driven() -> None:
+    port = FakePort()
+    source = serial_input(port)
+    source.open()
+    assert source.follows()
+    assert port.rts
+    port.shorted = True
+    assert source.is_closed()
+    assert not source.follows()
+    assert port.rts
+
+
+def test_other_lines_can_be_chosen() -> None:
+    port = FakePort()
+    source = serial_input(port, drive="dtr", line="cd")
+    source.open()
+    assert port.dtr
+    assert source.is_closed()
+    assert source.where == "/dev/null CD"
+
+
+def test_a_pulled_adapter_is_lost_and_the_port_let_go() -> None:
+    port = FakePort()
+    source = serial_input(port)
+    source.open()
+    port.gone = True
+    with pytest.raises(DeviceLostError, match="is gone"):
+        source.is_closed()
+    assert port.closed_n == 1
+    with pytest.raises(DeviceLostError, match="not open"):
+        source.follows()
+    with pytest.raises(DeviceMissingError, match=r"stop_input\.port"):
+        source.open()
+
+
+def test_a_port_that_is_not_there_or_has_no_lines_is_missing(tmp_path: Path) -> None:
+    missing = make_stop_input(StopInputSettings(backend="serial", port=str(tmp_path / "none")))
+    assert missing is not None
+    with pytest.raises(DeviceMissingError, match="Check its cable"):
+        missing.open()
+    # A pseudo-terminal opens, and has no modem lines: the ioctl fails.
+    import pty
+
+    master, slave = pty.openpty()
+    import os
+
+    try:
+        without = make_stop_input(StopInputSettings(backend="serial", port=os.ttyname(slave)))
+        assert without is not None
+        with pytest.raises(DeviceMissingError):
+            without.open()
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_settings() -> None:
+    assert make_stop_input(StopInputSettings()) is None
+    assert Config().stop_input.backend == "none"
+    with pytest.raises(ValidationError, match="needs a port"):
+        StopInputSettings(backend="serial")
+    assert isinstance(make_stop_input(StopInputSettings(backend="simulated", port="x")), SimulatedStopInput)
+
+
+@pytest.mark.parametrize("condition", ["open", "lost", "stale", "stuck"])
+def test_every_condition_stops_until_reset(condition: str) -> None:
+    row = CATALOGUE[f"stop_input.{condition}"]
+    assert row.reaction is Reaction.STOP
+    assert row.clear is Clear.ON_RESET
+    assert row.debounce_s == 0.0
+
+
+class Watching:
+    """A watch over the simulated loop, and what it told."""
+
+    def __init__(self, watch: StopInputWatch, loop: StopLoop, stops: list[tuple[float, str]]) -> None:
+        self.watch = watch
+        self.loop = loop
+        self.stops = stops
+
+    def conditions(self) -> list[str]:
+        return [fault.condition for fault in self.watch.faults(time.monotonic())]
+
+    async def until(self, reached: Callable[[], bool]) -> None:
+        async with asyncio.timeout(DEADLINE_S):
+            while not reached():
+                await asyncio.sleep(0.005)
+
+
+@asynccontextmanager
+async def watching(tmp_path: Path, source: StopInput | None = None, **settings: float) -> AsyncIterator[Watching]:
+    loop = StopLoop(tmp_path / "stop.sock")
+    await loop.start()
+    stops: list[tuple[float, str]] = []
+    watch = StopInputWatch(
+        StopInputSettings(backend="simulated", **settings),  # type: ignore[arg-type]  # as the model has them
+        source or SimulatedStopInput(str(loop.path)),
+        SystemClock(),
+        lambda reason: stops.append((time.monotonic(), reason)),
+    )
+    task = asyncio.create_task(watch.run(), name="watch")
+    try:
+        yield Watching(watch, loop, stops)
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+        await loop.close()
+        async with asyncio.timeout(DEADLINE_S):
+            while any(thread.name == "stop-input" for thread in threading.enumerate()):
+                await asyncio.sleep(0.01)
+
+
+async def test_before_the_first_reading_it_means_stop(tmp_path: Path) -> None:
+    watch = StopInputWatch(StopInputSettings(), SimulatedStopInput("nowhere"), SystemClock(), lambda _: None)
+    assert [fault.condition for fault in watch.faults(time.monotonic())] == ["lost"]
+
+
+async def test_a_press_is_told_at_once_and_once_and_stands_until_released(tmp_path: Path) -> None:
+    async with watching(tmp_path) as w:
+        await w.until(lambda: w.conditions() == [])
+        pressed_s = time.monotonic()
+        await w.loop.become("open")
+        await w.until(lambda: bool(w.stops))
+        # Two looks at 100 Hz; the rest is for a loaded machine.
+        assert w.stops[0][0] - pressed_s < 0.5
+        assert "open" in w.stops[0][1]
+        assert w.conditions() == ["open"]
+        await asyncio.sleep(0.1)
+        assert len(w.stops) == 1
+        await w.loop.become("closed")
+        await w.until(lambda: w.conditions() == [])
+
+
+async def test_a_lost_loop_is_told_and_found_again(tmp_path: Path) -> None:
+    async with watching(tmp_path) as w:
+        await w.until(lambda: w.conditions() == [])
+        await w.loop.become("gone")
+        await w.until(lambda: w.conditions() == ["lost"])
+        await w.until(lambda: bool(w.stops))
+        await w.loop.become("closed")
+        await w.until(lambda: w.conditions() == [])
+
+
+async def test_a_short_circuit_is_found_by_the_test_pulse(tmp_path: Path) -> None:
+    async with watching(tmp_path, test_every_s=0.05) as w:
+        await w.until(lambda: w.conditions() == [])
+        await w.loop.become("shorted")
+        await w.until(lambda: w.conditions() == ["stuck"])
+        await w.until(lambda: bool(w.stops))
+        await w.loop.become("closed")
+        await w.until(lambda: w.conditions() == [])
+
+
+async def test_a_port_that_blocks_is_stale_and_nothing_else_waits_for_it(tmp_path: Path) -> None:
+    release = threading.Event()
+
+    class Blocking(SimulatedStopInput):
+        def is_closed(self) -> bool:
+            release.wait(DEADLINE_S)
+            return super().is_closed()
+
+    async with watching(tmp_path, Blocking(str(tmp_path / "stop.sock")), stale_s=0.1) as w:
+        # Never read: lost from the beginning, whatever its age.
+        assert w.conditions() == ["lost"]
+        release.set()
+        await w.until(lambda: w.conditions() == [])
+        release.clear()
+        await w.until(lambda: w.conditions() == ["stale"])
+        release.set()
+        await w.until(lambda: w.conditions() == [])
+
+
+async def test_a_silent_loop_is_stale_then_lost(tmp_path: Path) -> None:
+    async with watching(tmp_path, stale_s=0.1) as w:
+        await w.until(lambda: w.conditions() == [])
+        await w.loop.become("silent")
+        await w.until(lambda: w.conditions() == ["stale"])
+        await w.until(lambda: w.conditions() == ["lost"])
+        await w.loop.become("closed")
+        await w.until(lambda: w.conditions() == [])
