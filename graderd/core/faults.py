@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 
 from graderd.hal.fault import DeviceFault
@@ -48,6 +48,8 @@ class FaultRow:
     debounce_s: float = 0.0
     clear: Clear = Clear.WHEN_GONE
     axes: frozenset[str] = ALL_AXES
+    automatic_only: bool = False
+    """The fault holds its axes only while automatic operation turns the blade: an operator sees for himself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,5 +143,5 @@ def _axes_of(device: str, row: FaultRow) -> FaultRow:
     """The lift rows hold both lifts; a fault of the tilt holds the tilt alone, unless the row says otherwise."""
     if row.key.startswith("actuator.") and row.axes == frozenset({"own"}):
         own = frozenset({"tilt"}) if device == "tilt" else frozenset({"lift"})
-        return FaultRow(row.key, row.reads, row.cause, row.remedy, row.reaction, row.debounce_s, row.clear, own)
+        return replace(row, axes=own)
     return row

@@ -136,6 +136,7 @@ class Step:
 
 def step(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSettings) -> Step:
     """One tick: faults first, then commands in their order, then automatic operation."""
+    before = state
     state = _react(state, inputs)
     replies: list[cmd.Reply] = []
     stop_asked = any(isinstance(c, cmd.Stop) for c in inputs.commands)
@@ -147,12 +148,14 @@ def step(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSett
             continue
         state, reply = _obey(state, command, inputs, settings)
         replies.append(reply)
-    state = _advance(state, inputs, settings, rule)
+    # "settled" speaks of the goals of the tick before: goals taken in this tick are not reached yet.
+    settled = inputs.settled and state.goals == before.goals
+    state = _advance(state, replace(inputs, settled=settled), settings, rule)
     armed = state.mode in ARMED
     return Step(
         state,
         Intents(
-            goals=_unheld(state.goals, held_axes(inputs.faults)) if armed else Goals(),
+            goals=_unheld(state.goals, held_axes(_counting(state, inputs))) if armed else Goals(),
             power=armed or state.arming_since_s is not None,
             stop=state.mode is Mode.STOPPED,
         ),
@@ -302,10 +305,15 @@ def _advance(state: State, inputs: Inputs, settings: MachineSettings, rule: Rule
     return state
 
 
+def _counting(state: State, inputs: Inputs) -> list[ActiveFault]:
+    """The faults that count in this mode."""
+    return [f for f in inputs.faults if state.mode is Mode.AUTO or not f.row.automatic_only]
+
+
 def _why_holding(state: State, inputs: Inputs) -> tuple[str, ...]:
     reasons = [
         f"{f.name} since {inputs.now_s - f.since_s:.1f} s: {f.row.reads}"
-        for f in inputs.faults
+        for f in _counting(state, inputs)
         if f.row.reaction >= Reaction.HOLD
     ]
     if state.mode is Mode.AUTO and state.decision.zone is None and not reasons:

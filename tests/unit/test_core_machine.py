@@ -255,6 +255,25 @@ def test_a_preset_goes_stage_by_stage() -> None:
     assert second.state.later == ()
 
 
+def test_a_preset_does_not_skip_its_first_stage_because_the_blade_stood_still() -> None:
+    taken = do(MANUAL, cmd.Preset(name="transport", client="a"), devices_active=True, settled=True)
+    assert taken.intents.goals == Goals(lift_left_mm=150.0, lift_right_mm=150.0)
+    assert taken.state.later == (Goals(rotation_deg=0.0),)
+    again = do(taken.state, cmd.Preset(name="transport", client="a"), devices_active=True, settled=True)
+    assert again.intents.goals == Goals(rotation_deg=0.0)
+
+
+def test_a_blind_camera_holds_automatic_operation_and_not_the_operator() -> None:
+    blind = fault(Reaction.HOLD, frozenset({"rotation"}))
+    blind = replace(blind, row=replace(blind.row, automatic_only=True))
+    assert do(JOGGING, devices_active=True, faults=(blind,)).intents.goals == Goals(rotation_deg=10.0)
+    assert do(JOGGING, devices_active=True, faults=(blind,)).state.holding == ()
+    turning = replace(AUTO, decision=Decision(Zone.LEFT, 30.0, NOW_S), goals=Goals(rotation_deg=30.0))
+    held = do(turning, devices_active=True, faults=(blind,))
+    assert held.intents.goals.empty
+    assert held.state.holding
+
+
 def test_faults_hold_only_the_axes_they_name() -> None:
     moving = replace(JOGGING, goals=Goals(1.0, 2.0, 3.0, 4.0))
     held = {

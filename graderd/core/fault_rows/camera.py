@@ -26,6 +26,7 @@ ROWS = (
         "wait: the camera is restarted by itself; check its cable if that does not help",
         Reaction.HOLD,
         axes=ROTATION,
+        automatic_only=True,
     ),
     FaultRow(
         "camera.black",
@@ -35,6 +36,7 @@ ROWS = (
         Reaction.HOLD,
         debounce_s=0.1,
         axes=ROTATION,
+        automatic_only=True,
     ),
     FaultRow(
         "camera.blown_out",
@@ -44,6 +46,7 @@ ROWS = (
         Reaction.HOLD,
         debounce_s=0.1,
         axes=ROTATION,
+        automatic_only=True,
     ),
     FaultRow(
         "camera.blocked",
@@ -53,6 +56,7 @@ ROWS = (
         Reaction.HOLD,
         debounce_s=0.1,
         axes=ROTATION,
+        automatic_only=True,
     ),
     FaultRow(
         "camera.frozen",
@@ -61,6 +65,7 @@ ROWS = (
         "pull and plug its cable if it does not go away by itself",
         Reaction.HOLD,
         axes=ROTATION,
+        automatic_only=True,
     ),
     FaultRow(
         "camera.blurred",
@@ -70,6 +75,7 @@ ROWS = (
         Reaction.HOLD,
         debounce_s=0.5,
         axes=ROTATION,
+        automatic_only=True,
     ),
     FaultRow(
         "camera.torn",
@@ -79,6 +85,7 @@ ROWS = (
         Reaction.HOLD,
         debounce_s=0.3,
         axes=ROTATION,
+        automatic_only=True,
     ),
     FaultRow(
         "camera.wrong_resolution",
@@ -105,6 +112,7 @@ ROWS = (
         Reaction.HOLD,
         debounce_s=0.5,
         axes=ROTATION,
+        automatic_only=True,
     ),
     FaultRow(
         "camera.worker_restarted",
