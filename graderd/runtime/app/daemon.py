@@ -123,8 +123,10 @@ class Daemon:
         answering = asyncio.Event()
         try:
             async with asyncio.TaskGroup() as group:
-                tasks = [
-                    group.create_task(self._serve(answering), name="api"),
+                tasks = [group.create_task(self._serve(answering), name="api")]
+                # A second daemon learns here that the socket is taken: before it touches a device.
+                await answering.wait()
+                tasks += [
                     group.create_task(self._loop.run(), name="control-tick"),
                     group.create_task(self._eyes.run(), name="perception"),
                     group.create_task(open_devices(self._loop), name="open-devices"),
@@ -135,7 +137,6 @@ class Daemon:
                     tasks.append(group.create_task(self._stop_input.run(), name="stop-input"))
                 if self._rig is not None:
                     tasks.append(group.create_task(self._rig.run(), name="rig"))
-                await answering.wait()
                 self._notifier.ready("disarmed")
                 log.info("ready on %s, disarmed", self._config.api.socket)
                 await self._ended.wait()
