@@ -203,4 +203,7 @@ def vcan(name: str) -> Iterator[str]:
         yield name
     finally:
         if interface_exists(name):
-            ip("link", "del", name)
+            # Linux before 6.1.192 waits here for as long as somebody has a J1939 socket open on it.
+            remove = subprocess.Popen(["ip", "link", "del", name])
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                remove.wait(5.0)

@@ -91,7 +91,7 @@ def service(rig: Rig) -> Iterator[Grader]:
     # The guest has one processor: the drop-in we ship for that. And its page faults are slow: keep memory once taken.
     (DROP_IN / "realtime.conf").write_bytes(Path("/usr/share/graderd/dropins/realtime.conf").read_bytes())
     (DROP_IN / "hil.conf").write_text(
-        "[Service]\nEnvironment=MALLOC_TRIM_THRESHOLD_=1000000000 MALLOC_MMAP_THRESHOLD_=1000000000\n", encoding="utf-8"
+        "[Service]\nTimeoutStopSec=40\nEnvironment=MALLOC_TRIM_THRESHOLD_=1000000000 MALLOC_MMAP_THRESHOLD_=1000000000\n", encoding="utf-8"
     )
     grader = Grader()
     grader.configure(rig.configuration() | FOR_THE_GUEST | {"can.channel": CAN})

@@ -143,9 +143,12 @@ def test_can_utils_read_and_write_the_same_bus(ready: Grader, rig: Rig, listener
         stderr=subprocess.STDOUT,
         text=True,
     )
-    time.sleep(0.5)
-    run("cansend", WIRE, f"18EA{OURS:02X}90#{COMPONENT_ID.to_bytes(3, 'little').hex().upper()}")
-    said = receiver.communicate(timeout=10)[0]
+    try:
+        time.sleep(1.0)
+        run("cansend", WIRE, f"18EA{OURS:02X}90#{COMPONENT_ID.to_bytes(3, 'little').hex().upper()}")
+        said = receiver.communicate(timeout=10)[0]
+    finally:
+        receiver.kill()
     assert "67 72 61 64 65 72 64" in said.lower(), said  # "graderd"
 
 
