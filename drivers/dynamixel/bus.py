@@ -59,6 +59,8 @@ class ServoBus:
         clock: monotonic seconds for the log's times.
         bus_log: called with every chunk of bytes sent and received.
         return_delay_s: the servos' Return Delay Time (factory 500 µs), part of each deadline.
+
+    ``last_valid_s``: clock time of the last valid status packet; ``unanswered_n``: requests without one since.
     """
 
     def __init__(
@@ -75,6 +77,7 @@ class ServoBus:
         self.low_latency = False
         self.latency_timer_ms: int | None = None
         self.last_valid_s = float("-inf")
+        self.unanswered_n = 0
         self._clock: Clock = clock or SystemClock()
         self._log = bus_log
         self._byte_s = _BITS_PER_BYTE / baud_n
@@ -287,6 +290,7 @@ class ServoBus:
             self._reply = None
         if answer is None:
             self._suspect = True
+            self.unanswered_n += 1
             self._counters["timeouts_n"] += 1
             self._allowance_s = min(_ALLOWANCE_MAX_S, self._allowance_s * 1.5)
             return None
@@ -386,6 +390,7 @@ class ServoBus:
         else:
             counters["replies_n"] += 1
             self.last_valid_s = self._clock.now_s()
+            self.unanswered_n = 0
             reply.set_result(packet)
 
 

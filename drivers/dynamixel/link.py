@@ -22,6 +22,7 @@ from graderd.hal.settings import RotatorSettings
 
 _REBOOT_S = 5.0
 _LOOK_EVERY_S = 0.05
+_MANY = 1_000_000
 
 
 class ServoLink:
@@ -99,9 +100,11 @@ class ServoLink:
         low_latency_n = now.pop("low_latency_n", 0)
         return {**(self.happened + now), "low_latency_n": low_latency_n}
 
-    def silence_s(self) -> float:
-        """Seconds since the last valid status packet."""
-        return self._clock.now_s() - (self.bus.last_valid_s if self.bus is not None else float("-inf"))
+    def silence(self) -> tuple[float, int]:
+        """Seconds since the last valid status packet, and requests without an answer since."""
+        if self.bus is None:
+            return float("inf"), _MANY
+        return self._clock.now_s() - self.bus.last_valid_s, self.bus.unanswered_n
 
     async def reboot(self) -> None:
         """Reboot the servo and wait until it is back and fits.

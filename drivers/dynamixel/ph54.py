@@ -50,6 +50,8 @@ _STOP_S = 0.5
 _STILL_READS_N = 5
 """So many reads in a row without movement are rest; one alone may be a turning point."""
 _CLOSE_S = 1.5
+_UNANSWERED_N = 3
+"""A lost servo left at least so many requests unanswered: a program that stood still asked none."""
 _LINK_FAULTS = ("no_reply", "corrupt_replies", "unplugged", "wrong_device")
 
 
@@ -446,8 +448,8 @@ class Ph54Rotator:
         try:
             await step
         except DeviceTimeoutError as e:
-            silent_s = self._link.silence_s()
-            if silent_s > self.settings.reply_timeout_s:
+            silent_s, unanswered_n = self._link.silence()
+            if silent_s > self.settings.reply_timeout_s and unanswered_n >= _UNANSWERED_N:
                 c = self._link.counters()
                 seen = f"{c.get('requests_n', 0)} requests, {c.get('foreign_n', 0)} replies with another id"
                 cause = f"no valid status packet for {silent_s:.2f} s ({seen})"

@@ -19,7 +19,7 @@ from drivers.dynamixel.virtual import VirtualServo, VirtualServoBus
 from graderd.hal.errors import DeviceMissingError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import RotatorSettings
-from tests.dynamixel_sim import PATIENCE_S, bench, servo_process
+from tests.dynamixel_sim import PATIENCE_S, bench, servo_process, until
 
 # A daemon in miniature: arms, turns for ever, says when it is under way.
 CLIENT = """
@@ -142,8 +142,7 @@ async def test_safe_off_after_the_daemon_died(tmp_path: Path, at_exit: str) -> N
     text = await asyncio.to_thread(safe_off, settings)
     assert "rotation" in text
     assert servo.torque_enabled is (at_exit == "on")
-    await asyncio.sleep(0.3)
-    assert abs(servo.shaft_velocity_deg_per_s) < 0.5
+    await until(lambda: abs(servo.shaft_velocity_deg_per_s) < 0.5, "does not come to rest")
     await wire.close()
 
 

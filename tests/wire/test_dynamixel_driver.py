@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -59,7 +60,7 @@ async def test_opening_writes_nothing_but_the_status_return_level(tmp_path: Path
 
 
 async def test_hold_is_the_very_next_packet(tmp_path: Path) -> None:
-    tap, rotator, wire = await tapped(tmp_path, VirtualServo())
+    tap, rotator, wire = await tapped(tmp_path, VirtualServo(), goal_timeout_s=5.0)
     wire.inject("delay", seconds=0.004)  # so that there is usually a request in flight
     await rotator.arm()
     for i in range(12):
@@ -76,7 +77,7 @@ async def test_hold_is_the_very_next_packet(tmp_path: Path) -> None:
 
 
 async def test_goals_are_sent_once_and_the_profile_only_after_a_hold(tmp_path: Path) -> None:
-    tap, rotator, wire = await tapped(tmp_path, VirtualServo())
+    tap, rotator, wire = await tapped(tmp_path, VirtualServo(), goal_timeout_s=5.0)
     await rotator.arm()
     start = len(tap.sent)
     for _ in range(10):
@@ -89,9 +90,9 @@ async def test_goals_are_sent_once_and_the_profile_only_after_a_hold(tmp_path: P
     await until(lambda: tap.writes(start)[-1][0] == PROFILE, "no hold")
     held = int.from_bytes(tap.writes(start)[-1][1][:4], "little")
     rotator.set_goal_deg(6.0)
-    await until(
-        lambda: len(tap.writes(start)) >= 3 and tap.writes(start)[-1][1][:4] != tap.writes(start)[-2][1][:4], "no"
-    )
+    goal_again = rotator.calibration.counts(6.0).to_bytes(4, "little", signed=True)
+    await until(lambda: tap.writes(start)[-1][1].endswith(goal_again), "no goal after the hold")
+    assert tap.writes(start)[-1][0] == PROFILE
     assert held == 10 * int.from_bytes(tap.writes(start)[-1][1][:4], "little") == 6000
     await rotator.close()
     await wire.close()
@@ -219,5 +220,5 @@ async def test_telemetry_comes_at_the_poll_rate(tmp_path: Path) -> None:
             angle = (await rig.rotator.wait_telemetry()).angle_deg
             assert angle is not None
             times_s.append(angle.time_s)
-        gaps_s = sorted(b - a for a, b in zip(times_s, times_s[1:], strict=False))
+        gaps_s = sorted(b - a for a, b in pairwise(times_s))
         assert gaps_s[len(gaps_s) // 2] == pytest.approx(0.02, abs=0.003)

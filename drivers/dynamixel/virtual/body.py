@@ -112,6 +112,10 @@ class ServoBody:
         """An instruction packet was on the bus: any packet feeds the watchdog."""
         self._fed_s = max(self._fed_s, at_s)
 
+    def forgive(self, stall_s: float) -> None:
+        """The program around the servo stood still for so long: that is not silence on the bus."""
+        self._fed_s += stall_s
+
     def advance(self, now_s: float) -> None:
         """Let time pass up to ``now_s`` (monotonic seconds, never back)."""
         if self._now_s is None:
