@@ -105,6 +105,14 @@ class ActuatorFault(_Command):
     params: Params = {}
 
 
+class CanFrame(_Command):
+    """Put a message of some other node on the actuators' bus."""
+
+    cmd: Literal["can_frame"]
+    can_id: int = Field(ge=0, lt=1 << 29)
+    data_hex: str = Field(pattern=r"^([0-9a-f]{2}){0,8}$")
+
+
 class StopLoopState(_Command):
     """The stop loop: ``closed`` permits, ``open`` is a pressed button, ``shorted`` reads closed whatever happens,
     ``silent`` does not answer, ``gone`` is a pulled plug."""
@@ -162,6 +170,7 @@ Command = Annotated[
     | CameraFault
     | ServoFault
     | ActuatorFault
+    | CanFrame
     | StopLoopState
     | ClearFaults
     | Faults

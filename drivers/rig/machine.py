@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 from typing import Any
 
 import can
 
-from drivers.dynamixel.virtual import VirtualServo, VirtualServoBus
+from drivers.dynamixel.virtual import VirtualServoBus
+from drivers.electrak.j1939.ids import Frame
 from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
 from drivers.rig.blade import GROUND_LIFT_MM, LEVEL_TILT_MM, BladePose
+from drivers.rig.wire_times import ControlTimes, TimedServo
 from drivers.rig.world import World
+from graderd.hal.clock import SystemClock
 
 _ADDRESSES = {"lift_left": 19, "lift_right": 20, "tilt": 27}
 _LONGEST_STEP_S = 0.05
@@ -31,7 +35,7 @@ class Machine:
 
     def __init__(self, servo_link: Path, can_link: Path, can_bus: can.BusABC | None, seed: int) -> None:
         self.world = World()
-        self.servo = VirtualServo(servo_id=1, seed=seed)
+        self.servo = TimedServo(servo_id=1, seed=seed)
         self.servo_bus = VirtualServoBus([self.servo], servo_link)
         self.lift_left = VirtualElectrak("electrak_hd_b017", _ADDRESSES["lift_left"], GROUND_LIFT_MM, seed)
         self.lift_right = VirtualElectrak("electrak_hd_b017", _ADDRESSES["lift_right"], GROUND_LIFT_MM, seed + 1)
@@ -39,6 +43,7 @@ class Machine:
         self.actuator_bus = VirtualActuatorBus(
             [self.lift_left, self.lift_right, self.tilt], link=None if can_bus else can_link, bus=can_bus
         )
+        self._control_times = ControlTimes(_ADDRESSES, SystemClock())
         self.servo_faults: dict[str, dict[str, float]] = {}
         self.actuator_faults: dict[str, dict[str, float]] = {}
 
@@ -46,6 +51,7 @@ class Machine:
         """Plug both wires in."""
         await self.servo_bus.start()
         await self.actuator_bus.start()
+        self.actuator_bus.listen(self._control_times.hear)
 
     async def close(self) -> None:
         """Pull both wires out; idempotent."""
@@ -103,6 +109,10 @@ class Machine:
             self.actuator_bus.inject(name, address=None if device is None else _ADDRESSES[device], **rest)
         self.actuator_faults[name] = dict(params)
 
+    def send_frame(self, can_id: int, data: bytes) -> None:
+        """A message of some other node on the actuators' bus (29-bit identifier)."""
+        self.actuator_bus.send(Frame(can_id, data))
+
     def clear_servo_faults(self) -> None:
         """End the servo's faults."""
         self.servo_bus.clear_faults()
@@ -156,4 +166,6 @@ class Machine:
             "lift_left_enabled": self.lift_left.motion_enabled,
             "lift_right_enabled": self.lift_right.motion_enabled,
             "tilt_enabled": self.tilt.motion_enabled,
+            "servo_goal_written_s": self.servo.goal_written_s if math.isfinite(self.servo.goal_written_s) else None,
+            **self._control_times.state(),
         }

@@ -19,6 +19,9 @@ from graderd.hal.stop_input import StopInput
 
 DEVICE = "stop_input"
 RETRY_S = 0.5
+FIRST_WORD_S = 1.0
+"""The machine starts disarmed, and its devices take as long to open: until the first look nothing needs to stop. A start
+that found the loop closed would else have to be reset like a stop."""
 
 log = logging.getLogger(__name__)
 
@@ -45,10 +48,13 @@ class StopInputWatch:
         self._ending = threading.Event()
         self._word = _Word("lost", f"{source.where} was not read yet", clock.now_s())
         self._since_s = clock.now_s()
+        self._quiet_until_s = clock.now_s() + FIRST_WORD_S
 
     def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """Why operation is not permitted; empty while the loop is closed."""
         word = self._word
+        if now_s < self._quiet_until_s:
+            return ()
         age_s = now_s - word.time_s
         if age_s > self._settings.stale_s and word.condition != "lost":
             return (DeviceFault(DEVICE, "stale", f"{self._source.where}: no reading for {age_s:.2f} s", word.time_s),)
@@ -100,6 +106,7 @@ class StopInputWatch:
     def _say(self, loop: asyncio.AbstractEventLoop, condition: str, detail: str) -> None:
         now_s = self._clock.now_s()
         former, self._word = self._word, _Word(condition, detail, now_s)
+        self._quiet_until_s = now_s
         if condition == former.condition:
             return
         self._since_s = now_s

@@ -20,7 +20,7 @@ from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceLostError, DeviceMissingError
 from graderd.hal.settings import StopInputSettings
 from graderd.hal.stop_input import StopInput
-from graderd.runtime.stop_input import StopInputWatch
+from graderd.runtime.stop_input import FIRST_WORD_S, StopInputWatch
 
 DEADLINE_S = 5.0
 
@@ -184,9 +184,11 @@ async def watching(tmp_path: Path, source: StopInput | None = None, **settings: 
                 await asyncio.sleep(0.01)
 
 
-async def test_before_the_first_reading_it_means_stop(tmp_path: Path) -> None:
+async def test_without_a_first_reading_it_soon_means_stop(tmp_path: Path) -> None:
     watch = StopInputWatch(StopInputSettings(), SimulatedStopInput("nowhere"), SystemClock(), lambda _: None)
-    assert [fault.condition for fault in watch.faults(time.monotonic())] == ["lost"]
+    now_s = time.monotonic()
+    assert watch.faults(now_s) == ()
+    assert [fault.condition for fault in watch.faults(now_s + FIRST_WORD_S)] == ["lost"]
 
 
 async def test_a_press_is_told_at_once_and_once_and_stands_until_released(tmp_path: Path) -> None:
@@ -235,7 +237,7 @@ async def test_a_port_that_blocks_is_stale_and_nothing_else_waits_for_it(tmp_pat
 
     async with watching(tmp_path, Blocking(str(tmp_path / "stop.sock")), stale_s=0.1) as w:
         # Never read: lost from the beginning, whatever its age.
-        assert w.conditions() == ["lost"]
+        assert [f.condition for f in w.watch.faults(time.monotonic() + FIRST_WORD_S)] == ["lost"]
         release.set()
         await w.until(lambda: w.conditions() == [])
         release.clear()

@@ -113,8 +113,9 @@ async def enter(stack: Stack, phase: Phase) -> None:
             f"no turn from {angle_deg:.0f}° ({stack.status['soil']['zone']})",
         )
     elif phase is Phase.LIFTING:
-        low = watch.newest().state["lift_left_mm"] < 160.0
-        await stack.move("preset", name="high" if low else "low")
+        state = watch.newest().state
+        height = "high" if state["lift_left_mm"] < 160.0 else "low"
+        await stack.move("preset", name=f"{height}_{'right' if state['blade_deg'] > 0.0 else 'left'}")
         await stack.until(
             lambda: all(watch.moving((axis,)) for axis in ("lift_left", "lift_right", "rotation")),
             5.0,
@@ -139,8 +140,7 @@ async def run_case(stack: Stack, case: Case, phase: Phase) -> Outcome:
     began_s = time.monotonic()
     stack.new_log_errors()
     try:
-        await make_ready(stack)
-        await enter(stack, phase)
+        await _come_to(stack, phase)
         await (case.conduct or general)(stack, case, phase, outcome)
     except CampaignError as error:
         outcome.problems.append(str(error))
@@ -156,9 +156,21 @@ async def run_case(stack: Stack, case: Case, phase: Phase) -> Outcome:
     return outcome
 
 
+async def _come_to(stack: Stack, phase: Phase) -> None:
+    """Ready and into the phase; a loaded machine may need a second try, for its servo's watchdog waits for nobody."""
+    for attempts_left_n in (2, 1, 0):
+        try:
+            await make_ready(stack)
+            await enter(stack, phase)
+            return
+        except CampaignError as error:
+            if not attempts_left_n:
+                status = await stack.read_status() or {}
+                raise CampaignError(f"{error} ({status.get('mode')}: {status.get('reason')})") from None
+
+
 async def general(stack: Stack, case: Case, phase: Phase, outcome: Outcome) -> None:
     """Inject, see it named, see it stop what the catalogue says, take the cause away, see it recover."""
-    fault = case.faults[0]
     before = "auto" if phase is Phase.TURNING else "manual"
     shows = not case.needs or phase is Phase.LIFTING or (phase is Phase.TURNING and case.needs == "rotation")
     from_s = time.monotonic()
@@ -171,8 +183,6 @@ async def general(stack: Stack, case: Case, phase: Phase, outcome: Outcome) -> N
     await detect(stack, case, outcome, from_s)
     await react(stack, case, outcome, from_s, before)
     await recover(stack, case, outcome, before)
-    if fault not in outcome.seen and outcome.detected:
-        outcome.problems.append(f"named {', '.join(outcome.seen)} instead of {fault}")
 
 
 async def detect(stack: Stack, case: Case, outcome: Outcome, from_s: float) -> None:
@@ -204,8 +214,7 @@ async def react(stack: Stack, case: Case, outcome: Outcome, from_s: float, befor
     # Some more time under the fault: what began to move again would be seen, and later faults would be named.
     await asyncio.sleep(0.2)
     status = await stack.read_status() or {}
-    names_seen = {f["name"] for f in status.get("faults", [])}
-    outcome.seen = tuple(sorted(names_seen | ({fault} if outcome.detected and fault in outcome.message else set())))
+    outcome.seen = tuple(sorted(f["name"] for f in status.get("faults", [])))
     outcome.final_state = str(status.get("mode", "no answer"))
     if stopping:
         outcome.standstill_s = watch.standstill_s(stopping, from_s)

@@ -39,16 +39,28 @@ directory = "{directory}/records"
 min_free_mb = 0.0
 [state]
 directory = "{directory}/state"
-[presets.high]
-rotation_deg = 20.0
+[presets.high_left]
+rotation_deg = 25.0
 height_mm = 120.0
 pitch_deg = 8.0
-[presets.low]
-rotation_deg = -20.0
+[presets.high_right]
+rotation_deg = -25.0
+height_mm = 120.0
+pitch_deg = 8.0
+[presets.low_left]
+rotation_deg = 25.0
 height_mm = 10.0
 pitch_deg = -8.0
+[presets.low_right]
+rotation_deg = -25.0
+height_mm = 10.0
+pitch_deg = -8.0
+[stop_input]
+backend = "simulated"
+stale_s = 1.0
 """
-"""Ten pictures a second keep a loaded machine free for what is measured; presets ``high`` and ``low`` move all axes."""
+"""Ten pictures a second keep a loaded machine free for what is measured; the presets move all axes. The stop
+input is the rig's, which shares the machine with everything else: it is given more time than a real one."""
 
 
 class CampaignError(Exception):

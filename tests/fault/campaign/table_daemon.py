@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import resource
 import signal
 import sys
 import time
@@ -43,11 +42,6 @@ async def freeze(stack: Stack) -> None:
     stack.daemon.send_signal(signal.SIGSTOP)
     await asyncio.sleep(1.0)
     stack.daemon.send_signal(signal.SIGCONT)
-
-
-async def starve_worker(stack: Stack) -> None:
-    """No more memory for the perception child."""
-    resource.prlimit(stack.worker_pid(), resource.RLIMIT_AS, (1 << 26, 1 << 26))
 
 
 def _record(stack: Stack) -> Path:
@@ -98,6 +92,15 @@ def lie(text: str) -> Action:
 async def tell_truth(stack: Stack) -> None:
     """The child is honest again."""
     (stack.directory / "lie.json").unlink(missing_ok=True)
+
+
+def loop(state: str) -> Action:
+    """The stop input's loop."""
+
+    async def inject(stack: Stack) -> None:
+        await stack.ask_rig("stop_loop", state=state)
+
+    return inject
 
 
 async def cut_all(stack: Stack) -> None:
@@ -339,6 +342,12 @@ DAEMON = (
             short=(TURNING, LIFTING)),
     _daemon("flooded", "thousands of API requests a second", "", nothing, conduct=flood, short=(TURNING,)),
     _daemon("malformed", "malformed API requests", "", nothing, conduct=malformed),
+    _daemon("stop_pressed", "the stop loop opens", "stop_input.open", loop("open"), loop("closed"), detect_s=0.3,
+            short=(LIFTING,)),
+    _daemon("stop_unplugged", "the stop input's adapter is pulled", "stop_input.lost", loop("gone"), loop("closed"),
+            detect_s=0.3),
+    _daemon("stop_silent", "the stop input's adapter hangs", "stop_input.lost stop_input.stale", loop("silent"),
+            loop("closed"), detect_s=1.3),
     _daemon("all_wires_cut", "servo, CAN adapter and camera unplugged together",
             "rotation.unplugged can.unplugged", cut_all, heal),
 )  # fmt: skip
@@ -350,7 +359,8 @@ PERCEPTION = (
     Case("perception_overconfident", "a confidence of 1e6", ("daemon.perception_nonsense",),
          lie('{"fields": {"confidence": 1e6}}'), tell_truth),
     Case("perception_out_of_memory", "the child gets no more memory",
-         ("camera.stale", "camera.worker_restarted", "camera.worker_hung"), starve_worker, nothing, detect_s=0.8,
+         ("camera.stale", "camera.worker_restarted", "camera.worker_hung"), lie('{"memory_error": true}'), tell_truth,
+         detect_s=0.8,
          log_errors=("",)),
 )  # fmt: skip
 """A child without memory ends with whatever its libraries say on standard error; those lines belong to the fault."""
