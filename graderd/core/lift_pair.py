@@ -277,7 +277,9 @@ class LiftPair:
     def _wait(self, deviations_mm: tuple[float, float]) -> None:
         """Begin or end the waiting of a side that is too far ahead."""
         settings = self._settings
-        if self._waiting is None:
+        if all(abs(side.target_mm - side.position_mm) < settings.apart_mm for side in self._sides):
+            self._waiting = None  # at the end each side finds its own rest
+        elif self._waiting is None:
             ahead_mm = [2.0 * d * s.sense for s, d in zip(self._sides, deviations_mm, strict=True)]
             index = 0 if ahead_mm[0] > ahead_mm[1] else 1
             far = ahead_mm[index] > settings.wait_mm and abs(self._sides[index].way_mm) > _MOVED_MM
@@ -295,7 +297,8 @@ class LiftPair:
     def _catch_up_mm(self, waiting: int) -> float:
         """Where the side behind is level with the one that waits."""
         ahead, behind = self._sides[waiting], self._sides[1 - waiting]
-        return behind.start_mm + (ahead.position_mm - ahead.start_mm) / ahead.way_mm * behind.way_mm
+        progress = min(max((ahead.position_mm - ahead.start_mm) / ahead.way_mm, 0.0), 1.0)
+        return behind.start_mm + progress * behind.way_mm
 
     def _catch_up(self, waiting: int) -> tuple[SideCommand, SideCommand]:
         """One side holds; the other goes slowly to the same point of the way and rests there, then both start anew."""

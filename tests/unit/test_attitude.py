@@ -171,15 +171,16 @@ class Lift:
         for axis in self.machine.axes.values():
             await axis.arm()
 
-    async def go(self, target_mm: float, *, timeout_s: float = 15.0) -> float:
-        """Seconds until both stand at the target."""
+    async def go(self, left_mm: float, right_mm: float | None = None, *, timeout_s: float = 15.0) -> float:
+        """Seconds until both stand at their targets (the right one's is the left one's where not given)."""
         self.pair.release()
         self.worst_apart_mm, start_s = 0.0, self.loop.now_s()
+        targets_mm = (left_mm, left_mm if right_mm is None else right_mm)
         left, right = (self.machine.units[name] for name in ("lift_left", "lift_right"))
         axes = [self.machine.axes[name] for name in ("lift_left", "lift_right")]
         while self.loop.now_s() - start_s < timeout_s:
             now_s, (left_seen, right_seen) = self.loop.now_s(), (self._reading(axis) for axis in axes)
-            command = self.pair.step(now_s, left_seen, right_seen, target_mm, target_mm)
+            command = self.pair.step(now_s, left_seen, right_seen, *targets_mm)
             self.stopped = command.stopped
             for axis, side in zip(axes, (command.left, command.right), strict=True):
                 if side.target_mm is None:
@@ -188,9 +189,8 @@ class Lift:
                     axis.set_target_mm(side.target_mm, side.speed_share)
             await asyncio.sleep(0.02)
             self.worst_apart_mm = max(self.worst_apart_mm, abs(left.position_mm - right.position_mm))
-            if self.stopped or all(
-                abs(u.position_mm - target_mm) < 1.6 and not u.velocity_mm_per_s for u in (left, right)
-            ):
+            there = (abs(u.position_mm - t) < 1.6 for u, t in zip((left, right), targets_mm, strict=True))
+            if self.stopped or (all(there) and not left.velocity_mm_per_s and not right.velocity_mm_per_s):
                 break
         return self.loop.now_s() - start_s
 
@@ -261,5 +261,29 @@ def test_a_stuck_or_lost_side_stops_the_other_in_mid_lift(fault: str) -> None:
             await asyncio.sleep(0.3)
             assert left.velocity_mm_per_s == 0.0
             assert left.position_mm < 250.0
+
+    run_simulated(main)
+
+
+@pytest.mark.parametrize("slow", [None, "lift_left", "lift_right"])
+def test_level_and_slope_moves_in_a_row_all_arrive(slow: str | None) -> None:
+    """Ways of 6:1, against each other, one side only: every one ends at its targets, none is stopped."""
+
+    async def main(loop: SimulatedLoop) -> None:
+        async with Machine(loop, names=("lift_left", "lift_right")) as machine:
+            if slow:
+                machine.units[slow].behaviour.speed_factor = 0.7
+            lift = Lift(machine, loop)
+            await lift.arm()
+            errors_mm = []
+            for left_mm, right_mm in (
+                (160, 110), (100, 100), (130, 70), (100, 100), (200, 195), (100, 104), (100, 150), (120, 150), (5, 295)
+            ):  # fmt: skip
+                took_s = await lift.go(left_mm, right_mm)
+                assert lift.stopped == ""
+                assert took_s < 12.0
+                errors_mm.append(abs(machine.units["lift_left"].position_mm - left_mm))
+                errors_mm.append(abs(machine.units["lift_right"].position_mm - right_mm))
+            assert max(errors_mm) < 1.6
 
     run_simulated(main)
