@@ -166,6 +166,7 @@ class _Demo:
         """Square blade, new soil, automatic operation, settle, drive."""
         await self.command("manual")
         await self._rig.request("scene", zone="none")
+        await self._rig.request("reset_vehicle")
         await self._square()
         await self._rig.request("scene", zone=zone)
         self._show.event("scene", zone=zone)
