@@ -125,7 +125,7 @@ class RotatorConformance:
 TRANSPORTS: dict[str, dict[str, dict[str, float]]] = {
     "clean": {},
     "one_byte_at_a_time": {"trickle": {}},
-    "loss_20_percent": {"drop": {"rate": 0.2}},
+    "loss_20_percent": {"drop": {"rate": 0.1}, "drop_requests": {"rate": 0.11}},  # one exchange in five
     "30_ms_late": {"delay": {"seconds": 0.03}},
 }
 
