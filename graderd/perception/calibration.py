@@ -28,14 +28,19 @@ STEPS = np.array([1e-4, 1e-4, 1e-4, 5e-3, 5e-3, 5e-3, 1e-4, 1e-4, 1e-4])
 """Steps of the numerical derivatives: metres and degrees."""
 BANDS_M = (0.14, 0.10, 0.07, 0.05, 0.035, 0.025, 0.02, 0.015, 0.012)
 """How far from the blade's place the evidence is looked for, round by round."""
+COLOR_ONLY_BANDS_M = (0.05, 0.04, 0.03, 0.02, 0.015, 0.012, 0.012, 0.012)
+"""Further away, any edge of a picture may pass for the blade's."""
 DEPTH_SIGMA_M = 0.003
 COLOR_SIGMA_PX = 1.0
 PRIOR_SIGMA = np.array([0.5, 0.5, 0.5, 30.0, 30.0, 30.0, 0.02, 0.03, 0.03])
 """How far a number may plausibly be from where it starts: metres and degrees. Decides only what is not seen."""
+COLOR_ONLY_SIGMA_M = 0.003
+"""Without depth the picture tells only ratios: the blade's size must be known, and sets the scale."""
 MIN_FRAMES_N = 3
 MIN_SPAN_DEG = 20.0
 MAX_RESIDUAL_MM = 12.0
 MAX_RESIDUAL_PX = 6.0
+MIN_AGREEMENT = 0.5
 MAX_UNCERTAIN_MM = 10.0
 MAX_UNCERTAIN_DEG = 1.0
 
@@ -67,7 +72,9 @@ class CalibrationResult:
 def calibrate(
     views: Sequence[EmptyBlade], start: CameraCalibration, blade: BladeGeometry, when: str = ""
 ) -> CalibrationResult:
-    """Solve camera pose and blade geometry, beginning at ``start`` (right within some 10 cm and 8 degrees).
+    """Solve camera pose and blade geometry, beginning at ``start``.
+
+    It must be right within some 10 cm and 8 degrees, without depth within 1 cm and 1 degree.
 
     ``when`` is written into the calibration as ``calibrated_at``.
 
@@ -76,7 +83,8 @@ def calibrate(
     """
     _check(views)
     solver = _Solver(views, start, blade)
-    for band_m in BANDS_M:
+    has_depth = any(view.frame.depth_mm is not None for view in views)
+    for band_m in BANDS_M if has_depth else COLOR_ONLY_BANDS_M:
         solver.step(band_m)
     return solver.result(when)
 
@@ -118,7 +126,10 @@ class _Solver:
         self._p = self._first.copy()
         self._depth: list[DepthEvidence] = []
         self._color: list[ColorEvidence] = []
-        self._normal: F64 = np.eye(len(self._p))
+        self._information: F64 = np.eye(len(self._p))
+        self._prior_sigma = PRIOR_SIGMA.copy()
+        if not self._with_depth():
+            self._prior_sigma[len(POSE) :] = COLOR_ONLY_SIGMA_M
 
     def _model(self, p: F64) -> tuple[CameraCalibration, BladeGeometry]:
         calibration = with_pose(self._start, dict(zip(POSE, map(float, p[:6]), strict=True)))
@@ -177,11 +188,13 @@ class _Solver:
             ahead[i] += h
             back[i] -= h
             jacobian[:, i] = (self._residuals(ahead) - self._residuals(back)) / (2 * h)
+        prior = np.diag(1.0 / self._prior_sigma**2)
         weight = 1.0 / (1.0 + (r / 3.0) ** 2)  # Cauchy: an edge of soil or a hose has little say
-        prior = np.diag(1.0 / PRIOR_SIGMA**2)
-        self._normal = jacobian.T @ (jacobian * weight[:, None]) + prior
+        data = jacobian.T @ (jacobian * weight[:, None])
+        # Neighbouring pixels err together: for the uncertainty a tenth of them counts.
+        self._information = data / 10.0 + prior
         pull = prior @ (self._first - self._p)
-        self._p = self._p + np.linalg.solve(self._normal, -jacobian.T @ (weight * r) + pull)
+        self._p = self._p + np.linalg.solve(data + prior, -jacobian.T @ (weight * r) + pull)
 
     def result(self, when: str) -> CalibrationResult:
         """Residuals, uncertainties and the final judgement."""
@@ -197,8 +210,7 @@ class _Solver:
         residual_mm = _robust_rms(np.concatenate(parts_mm)) if parts_mm else None
         edges = np.concatenate(parts_px) if parts_px else np.zeros(0)
         residual_px = _robust_rms(edges) if edges.size >= 10 * len(self._views) else None
-        # Neighbouring pixels err together: count a tenth of them.
-        sigma = np.sqrt(np.diag(np.linalg.inv(self._normal)) * 10.0)
+        sigma = np.sqrt(np.diag(np.linalg.inv(self._information)))
         uncertainty = dict(zip((*POSE, *GEOMETRY), map(float, sigma), strict=True))
         self._judge(residual_mm, residual_px, uncertainty)
         calibration = calibration.model_copy(
@@ -218,6 +230,12 @@ class _Solver:
             )
         if residual_mm is None and (residual_px is None or residual_px > MAX_RESIDUAL_PX):
             raise CalibrationError("the blade's outline does not fit the colour pictures; start nearer with --pose")
+        for evidence in self._depth:
+            if evidence.agreement < MIN_AGREEMENT:
+                raise CalibrationError(
+                    f"the frame at {evidence.angle_deg:+.1f} deg does not show the empty blade at that angle "
+                    f"({evidence.agreement * 100:.0f} % of what stands there lies on it)"
+                )
         for name, value in uncertainty.items():
             limit = MAX_UNCERTAIN_DEG if name.endswith("_deg") else MAX_UNCERTAIN_MM / 1000
             if value > limit:

@@ -17,15 +17,20 @@ MAX_GROUND_POINTS_N = 700
 EDGE_POINTS_N = 48
 ENDS_BANDS_N = 10
 TOP_BANDS_N = 16
+NEARBY_M = 0.2
 MIN_EDGE_GRAY = 6.0
 """An edge weaker than this (grey levels over two pixels) is no edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthEvidence:
-    """Points in the optical frame (N x 3, m) that lie on the face, the ground, the two ends and the upper edge."""
+    """Points in the optical frame (N x 3, m) that lie on the face, the ground, the two ends and the upper edge.
+
+    ``agreement``: of the points anywhere near the face, the share that lie on it; low where the angle is wrong.
+    """
 
     angle_deg: float
+    agreement: float
     face: F64
     ground: F64
     left_end: F64
@@ -62,7 +67,10 @@ def collect_depth(
     half, top = blade.length_m / 2, blade.bottom_z_m + blade.height_m
     face = d - blade.x_offset_m + face_setback_m(blade, z)
     on_face = np.abs(face) < band_m
-    body = on_face & (np.abs(s) < half - 0.02) & (z > blade.bottom_z_m + 0.03) & (z < top - 0.015)
+    before = (np.abs(s) < half - 0.02) & (z > blade.bottom_z_m + 0.03) & (z < top - 0.015)
+    body = on_face & before
+    nearby = int(np.count_nonzero(before & (np.abs(face) < NEARBY_M)))
+    agreement = np.count_nonzero(body) / nearby if nearby else 0.0
     clear = (np.abs(s) > half + 0.08) | (d > 0.12) | (d < -0.25)
     ground = (np.abs(z) < band_m) & clear & (np.hypot(s, d) < 1.3)
     wide = on_face & (np.abs(s) < half + band_m)
@@ -71,6 +79,7 @@ def collect_depth(
     left, right = _ends(points, s, z, wide, blade, 0.5 * pixel_m, view, angle_deg)
     return DepthEvidence(
         angle_deg,
+        float(agreement),
         _thinned(points[body], MAX_FACE_POINTS_N),
         _thinned(points[ground], MAX_GROUND_POINTS_N),
         left,

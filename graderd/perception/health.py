@@ -22,6 +22,7 @@ SAMPLE_STEP_PX = (12, 8)
 TILE_PX = 5
 FLAT_GRAY = 1.6
 """Standard deviation (grey levels) within a tile of the smoothed sample below which it shows nothing."""
+STILL_FLAT_PERCENT = 99.0
 CLIPPED_GRAY = 250
 BLUR_ROWS_N = 12
 BLUR_MIN_CONTRAST = 64.0
@@ -89,7 +90,10 @@ class HealthMonitor:
         if clipped > settings.blown_out_percent:
             return [PictureFault("blown_out", f"{clipped:.0f} % of the pixels are clipped")]
         flat = 100.0 * flat_share(np.asarray(gray, dtype=np.uint8))
-        if flat > settings.blocked_flat_percent:
+        # A photograph may have its smooth sky or wall; a camera that looks at the blade has not.
+        if flat > (
+            settings.blocked_flat_percent if self._live else max(STILL_FLAT_PERCENT, settings.blocked_flat_percent)
+        ):
             return [PictureFault("blocked", f"{flat:.0f} % of the picture shows no texture: something covers the lens")]
         return []
 

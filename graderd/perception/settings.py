@@ -135,7 +135,7 @@ class HealthSettings(Settings):
     )
     knocked_deg: Positive = Field(default=4.0, description="blade found turned by more than this: knocked")
     knocked_missing_percent: Percent = Field(
-        default=50.0, description="so much of the blade's face is not there: knocked"
+        default=30.0, description="so much of the blade's face is not there: knocked"
     )
     depth_valid_percent: Percent = Field(
         25.0, description="less valid depth than this in the whole picture: depth_missing"
