@@ -48,7 +48,7 @@ async def test_it_arms_turns_and_disarms(tmp_path: Path) -> None:
     async with running(tmp_path) as (machine, loop):
         seen: list[float] = []
         async with Maneuver(loop) as blade:
-            await blade.rotate_to(5.0, 2.0, lambda: seen.append(machine.rotation.position))
+            await blade.rotate_to(5.0, 5.0, lambda: seen.append(machine.rotation.position))
         assert machine.rotation.position == pytest.approx(5.0)
         assert len(seen) > 10
         assert seen == sorted(seen)
