@@ -81,6 +81,8 @@ _TAPER: Final = 0.5
 _AHEAD_N: Final = 3
 """A side is held back when it is too far ahead in so many steps; a single estimate is too noisy for that."""
 _STILL_MM_PER_S: Final = 2.0
+_PARALLEL_MM: Final = 3.0
+"""Ways that differ by less are meant to be equal."""
 _START_MM: Final = 1.3
 """A lift does not start for less than this."""
 _MOVED_MM: Final = 0.5
@@ -245,9 +247,14 @@ class LiftPair:
             deviations_mm = self._deviations_mm()
             for side, deviation_mm in zip(self._sides, deviations_mm, strict=True):
                 side.start_mm = side.position_mm - deviation_mm
-        self._moving = True
+        begins, self._moving = not self._moving, True
         for side, target_mm in zip(self._sides, targets_mm, strict=True):
             side.target_mm = target_mm
+        left, right = self._sides
+        if begins and abs(left.way_mm - right.way_mm) < _PARALLEL_MM:
+            # meant as a parallel move: what the sides differ by now is where they rested, and is made up for on the way
+            half_mm = (left.way_mm - right.way_mm) / 2.0
+            left.start_mm, right.start_mm = left.start_mm + half_mm, right.start_mm - half_mm
 
     def _deviations_mm(self) -> tuple[float, float]:
         """How far each side is off the line, in mm of extension."""
