@@ -44,6 +44,15 @@ class Bench:
             self.rotator.set_goal_deg(goal_deg)
             await asyncio.sleep(0.02)
 
+    def past(self, angle_deg: float) -> Callable[[], bool]:
+        """Condition: the measured angle is there or beyond (a moving blade may pass an exact angle unseen)."""
+
+        def beyond() -> bool:
+            angle = self.rotator.telemetry().angle_deg
+            return angle is not None and angle.value >= angle_deg
+
+        return beyond
+
     def at(self, angle_deg: float, tolerance_deg: float = 0.5) -> Callable[[], bool]:
         """Condition: the measured angle is there."""
 

@@ -59,7 +59,7 @@ class RotatorConformance:
 
     async def test_hold_stops_where_the_blade_is(self, bench: Bench) -> None:
         await bench.rotator.arm()
-        await bench.drive(50.0, bench.at(25.0, 3.0))
+        await bench.drive(50.0, bench.past(22.0))
         bench.rotator.hold()
         bench.rotator.hold()
         held_deg = bench.servo.shaft_deg
@@ -72,7 +72,7 @@ class RotatorConformance:
 
     async def test_a_goal_not_renewed_becomes_a_hold(self, bench: Bench) -> None:
         await bench.rotator.arm()
-        await bench.drive(50.0, bench.at(20.0, 3.0))
+        await bench.drive(50.0, bench.past(17.0))
         await bench.until(lambda: bench.rotator.telemetry().counters.get("goal_timeouts_n", 0) > 0)
         await bench.until(lambda: abs(bench.servo.shaft_velocity_deg_per_s) < 0.5)
         assert bench.servo.shaft_deg < 45.0
@@ -98,7 +98,7 @@ class RotatorConformance:
 
     async def test_disarm_takes_torque_off_and_can_be_armed_again(self, bench: Bench) -> None:
         await bench.rotator.arm()
-        await bench.drive(50.0, bench.at(20.0, 3.0))
+        await bench.drive(50.0, bench.past(17.0))
         await bench.rotator.disarm()
         await bench.rotator.disarm()
         assert bench.rotator.lifecycle is Lifecycle.STANDBY

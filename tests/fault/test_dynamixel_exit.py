@@ -105,7 +105,7 @@ async def test_the_bound_from_the_last_packet_to_standstill_in_the_servos_own_ti
 async def test_close_in_mid_turn_leaves_torque_as_configured(tmp_path: Path, at_exit: str, torque_on: bool) -> None:
     async with bench(tmp_path, torque_at_exit=at_exit, torque_at_disarm="on") as rig:
         await rig.rotator.arm()
-        await rig.drive(50.0, rig.at(20.0, 3.0))
+        await rig.drive(50.0, rig.past(17.0))
         loop = asyncio.get_running_loop()
         began_s = loop.time()
         await rig.rotator.close()

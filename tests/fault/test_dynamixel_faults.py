@@ -48,7 +48,7 @@ def standing(rig: Bench) -> bool:
 
 async def test_no_reply_fails_the_rotator_stops_the_blade_and_heals(rig: Bench) -> None:
     await rig.rotator.arm()
-    await rig.drive(50.0, rig.at(15.0, 2.0))
+    await rig.drive(50.0, rig.past(13.0))
     rig.bus.inject("drop_requests")
     await rig.until(lambda: rig.rotator.lifecycle is Lifecycle.FAILED)
     assert "no_reply" in rig.conditions()
@@ -141,7 +141,7 @@ async def test_an_alert_that_cuts_no_torque_leaves_the_rotator_active(rig: Bench
 
 async def test_a_tripped_watchdog_is_named_and_arming_clears_it(rig: Bench) -> None:
     await rig.rotator.arm()
-    await rig.drive(50.0, rig.at(15.0, 2.0))
+    await rig.drive(50.0, rig.past(13.0))
     # What a daemon that stood still for a while finds: the servo stopped by itself.
     rig.servo.memory["bus_watchdog"] = -1
     rig.servo.tripped = True
@@ -298,7 +298,7 @@ async def test_near_limits_warn_and_keep_working(
 async def test_unplug_in_mid_turn_and_replug_under_the_same_name(rig: Bench) -> None:
     loop = asyncio.get_running_loop()
     await rig.rotator.arm()
-    await rig.drive(50.0, rig.at(15.0, 2.0))
+    await rig.drive(50.0, rig.past(13.0))
     began_s = loop.time()
     await rig.bus.unplug()
     await rig.until(lambda: "unplugged" in rig.conditions())
