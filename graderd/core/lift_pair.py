@@ -24,7 +24,7 @@ class LiftPairSettings(Settings):
     """How closely the sides are kept together."""
 
     full_speed_mm_per_s: Positive = Field(50.0, description="guess of a lift's speed at speed share 1, until learned")
-    first_share: Positive = Field(0.36, le=1.0, description="speed share while a side's speed is still unknown")
+    first_share: Positive = Field(0.38, le=1.0, description="speed share while a side's speed is still unknown")
     min_share: Positive = Field(0.32, le=1.0, description="slowest speed share at which a lift moves well")
     catch_up_hz: Positive = Field(4.0, description="how much slower the side ahead goes, mm/s for each mm")
     wait_mm: Positive = Field(2.85, description="the side ahead stops from here on until the other has come up")
