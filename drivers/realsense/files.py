@@ -48,7 +48,7 @@ def pictures_in(folder: Path) -> list[Path]:
 class _Paced:
     """What folder and video have in common: frames handed out one after the other, at a rate or as fast as read."""
 
-    def __init__(self, settings: CameraSettings, real_time: bool) -> None:
+    def __init__(self, settings: CameraSettings, real_time: bool = True) -> None:
         self._path = Path(settings.path)
         self._repeat = settings.repeat
         self._period_s = 1.0 / settings.rate_hz if real_time else 0.0

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from drivers.rig.blade import BladePose
+from drivers.rig.ground import SceneState
 from drivers.rig.look import Look
 from drivers.rig.optics import knocked
-from drivers.rig.renderer import Renderer, SceneState
+from drivers.rig.renderer import Renderer
 from drivers.rig.soil import SoilField
 from graderd.core.blade import BladeGeometry
 from graderd.core.zones import Zone
