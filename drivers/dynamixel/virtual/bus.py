@@ -15,7 +15,7 @@ from drivers.dynamixel.codec import StatusError, StreamDecoder, crc16, encode_st
 from drivers.dynamixel.virtual.faults import ALERT_BITS, FAULTS
 from drivers.dynamixel.virtual.line import answers
 from drivers.dynamixel.virtual.servo import VirtualServo
-from drivers.dynamixel.virtual.timing import baud_of, busy_until, wire_s
+from drivers.dynamixel.virtual.timing import baud_of, busy_until, pty_round_trip_s, wire_s
 from graderd.hal.clock import Clock, SystemClock
 
 _TICK_S = 0.01
@@ -78,6 +78,7 @@ class VirtualServoBus:
         self._timers: set[asyncio.TimerHandle] = set()
         self._last_byte_s = 0.0
         self._turn_s = 0.0
+        self._detour_s = 0.0
 
     # -- life ---------------------------------------------------------------------------------------------------
 
@@ -144,6 +145,7 @@ class VirtualServoBus:
         tty.setraw(slave)
         tty.setraw(master)
         os.set_blocking(master, False)
+        self._detour_s = pty_round_trip_s(master, slave) if self.wire_time else 0.0
         # The slave stays open here: without one, reading the master would fail until a client comes.
         self._master, self._slave = master, slave
         self._decoder.reset()
@@ -276,7 +278,7 @@ class VirtualServoBus:
             ready_s = now_s + wire_s(len(packet.raw), baud_n)
             for servo, reply in answers(self.servos, packet, now_s):
                 ready_s += servo.memory["return_delay_time"] * _RETURN_DELAY_STEP_S + wire_s(len(reply), baud_n)
-                self._send(reply, ready_s if self.wire_time else now_s)
+                self._send(reply, ready_s - self._detour_s if self.wire_time else now_s)
         if self._answer_crc_errors and self._decoder.crc_errors_n > errors_n:
             self._send(encode_status(self.servos[0].servo_id, StatusError.CRC), now_s)
 

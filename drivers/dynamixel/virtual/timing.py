@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import fcntl
+import os
 import struct
+import time
 from collections.abc import Callable
 
 from graderd.hal.clock import Clock
@@ -38,6 +40,32 @@ def busy_until(clock: Clock, at_s: float, look: Callable[[], bool] = bool) -> bo
         if look():
             return True
     return False
+
+
+def pty_round_trip_s(master: int, slave: int, rounds_n: int = 64) -> float:
+    """What a byte needs through the pty and another one back, median, without anybody having to be woken up.
+
+    A real adapter has no such detour: who imitates wire time takes it off. Both ends must be raw and nobody else may
+    read them yet.
+    """
+    times_s = []
+    blocking = os.get_blocking(master), os.get_blocking(slave)
+    os.set_blocking(master, False)
+    os.set_blocking(slave, False)
+    for _ in range(rounds_n):
+        began_s = time.perf_counter()
+        for write_to, read_from in ((slave, master), (master, slave)):
+            os.write(write_to, b"\0")
+            while True:
+                try:
+                    if os.read(read_from, 1):
+                        break
+                except BlockingIOError:
+                    continue
+        times_s.append(time.perf_counter() - began_s)
+    os.set_blocking(master, blocking[0])
+    os.set_blocking(slave, blocking[1])
+    return sorted(times_s)[rounds_n // 2]
 
 
 def realtime_timers() -> None:
