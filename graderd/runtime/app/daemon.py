@@ -144,9 +144,10 @@ class Daemon:
                 for task in tasks:
                     task.cancel()
         finally:
+            await self._close_devices()
+            # Not earlier: a second signal, taken the default way, would end the process before the wires are safe.
             for number in (signal.SIGINT, signal.SIGTERM):
                 running.remove_signal_handler(number)
-            await self._close_devices()
             self._notifier.close()
 
     async def _serve(self, answering: asyncio.Event) -> None:

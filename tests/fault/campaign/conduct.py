@@ -105,8 +105,9 @@ async def enter(stack: Stack, phase: Phase) -> None:
     if phase is Phase.TURNING:
         angle_deg = watch.newest().state["blade_deg"]
         await stack.ask_rig("scene", zone="right" if angle_deg > 8.0 else "even", seed=3)
-        if not (await stack.command("auto"))["accepted"]:
-            raise CampaignError("automatic operation was refused")
+        answer = await stack.command("auto")
+        if not answer["accepted"]:
+            raise CampaignError(f"automatic operation was refused: {answer.get('message') or answer.get('error')}")
         await stack.until(
             lambda: abs(watch.newest().state["blade_deg"] - angle_deg) > 4.0 and watch.moving(("rotation",)),
             10.0,
@@ -140,7 +141,7 @@ async def run_case(stack: Stack, case: Case, phase: Phase) -> Outcome:
     began_s = time.monotonic()
     stack.new_log_errors()
     try:
-        await _come_to(stack, phase)
+        await come_to(stack, phase)
         await (case.conduct or general)(stack, case, phase, outcome)
     except CampaignError as error:
         outcome.problems.append(str(error))
@@ -156,7 +157,7 @@ async def run_case(stack: Stack, case: Case, phase: Phase) -> Outcome:
     return outcome
 
 
-async def _come_to(stack: Stack, phase: Phase) -> None:
+async def come_to(stack: Stack, phase: Phase) -> None:
     """Ready and into the phase; a loaded machine may need a second try, for its servo's watchdog waits for nobody."""
     for attempts_left_n in (2, 1, 0):
         try:
@@ -322,4 +323,4 @@ def _named(status: JsonObject, faults: tuple[str, ...]) -> list[str]:
     return [f["name"] for f in status.get("faults", []) if f["name"] in faults]
 
 
-__all__ = ["BRAKE_S", "SLACK_S", "detect", "general", "make_ready", "react", "run_case"]
+__all__ = ["BRAKE_S", "SLACK_S", "come_to", "detect", "general", "react", "run_case"]

@@ -1,7 +1,7 @@
 """``python -m tests.fault.campaign.flood SOCKET SECONDS``: as many requests a second as one process can send.
 
-Pipelines over a few connections and reads whatever comes back; prints ``{"sent_per_s", "refused_after_s"}`` (None
-where the daemon refused nothing and closed no connection).
+Pipelines over a few connections and reads whatever comes back; prints ``begun``, and at the end
+``{"sent_per_s", "refused_after_s"}`` (None where the daemon refused nothing and closed no connection).
 """
 
 from __future__ import annotations
@@ -61,6 +61,8 @@ class Hammer:
 async def main() -> None:
     """Hammer until the time is over."""
     hammer = Hammer(sys.argv[1], float(sys.argv[2]))
+    sys.stdout.write("begun\n")
+    sys.stdout.flush()
     await asyncio.gather(*(hammer.run() for _ in range(CONNECTIONS_N)))
     sys.stdout.write(json.dumps(hammer.result()) + "\n")
 

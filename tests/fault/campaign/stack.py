@@ -80,7 +80,7 @@ class Stack:
         self._rig: asyncio.subprocess.Process | None = None
         self._daemon: asyncio.subprocess.Process | None = None
         self._control = RigControl(directory / "control.sock")
-        self._client = httpx.AsyncClient(
+        self.client = httpx.AsyncClient(
             transport=httpx.AsyncHTTPTransport(uds=str(directory / "graderd.sock")),
             base_url="http://graderd",
             timeout=5.0,
@@ -111,7 +111,7 @@ class Stack:
                 except TimeoutError:
                     process.kill()
                     await process.wait()
-        await self._client.aclose()
+        await self.client.aclose()
         await self._control.close()
 
     async def start_rig(self) -> None:
@@ -191,7 +191,7 @@ class Stack:
     async def read_status(self) -> JsonObject | None:
         """The daemon's status now, None where it does not answer."""
         try:
-            response = await self._client.get("/v1/status")
+            response = await self.client.get("/v1/status")
         except httpx.TransportError:
             return None
         if response.status_code != 200:
@@ -202,7 +202,7 @@ class Stack:
     async def command(self, name: str, /, **fields: Any) -> JsonObject:
         """One command; ``accepted`` tells whether it was obeyed."""
         try:
-            response = await self._client.post("/v1/commands", json={"command": name, "client": CLIENT, **fields})
+            response = await self.client.post("/v1/commands", json={"command": name, "client": CLIENT, **fields})
         except httpx.TransportError as error:
             return {"accepted": False, "message": f"no answer: {error!r}"}
         answer: JsonObject = response.json()
@@ -210,7 +210,7 @@ class Stack:
 
     async def service(self, name: str, /, **arguments: Any) -> JsonObject:
         """One device service."""
-        answer: JsonObject = (await self._client.post(f"/v1/services/{name}", json=arguments)).json()
+        answer: JsonObject = (await self.client.post(f"/v1/services/{name}", json=arguments)).json()
         return answer
 
     async def until_status(

@@ -257,7 +257,7 @@ async def flood(stack: Stack, _: Case, phase: Phase, outcome: Outcome) -> None:
             stdout=asyncio.subprocess.PIPE,
         )
         said, _ = await process.communicate()
-        found = json.loads(said)
+        found = json.loads(said.splitlines()[-1])
         if found["sent_per_s"] < FLOOD_MIN_N:
             outcome.problems.append(f"only {found['sent_per_s']:.0f} requests a second were sent")
         outcome.detected, outcome.detection_s = found["refused_after_s"] is not None, found["refused_after_s"]
