@@ -61,6 +61,13 @@ def run_simulated(main: Callable[[SimulatedLoop], Coroutine[Any, Any, T]]) -> T:
         loop.close()
 
 
+async def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
+    """Wait in real time, on a machine that may be busy, until something is so."""
+    async with asyncio.timeout(timeout_s):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
 class Machine:
     """Two HD and one MD in process, a link, and their drivers; ``async with`` opens and closes everything."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import functools
 import itertools
 import socket
 import struct
@@ -20,7 +21,7 @@ from drivers.electrak.ports import PortLostError, SocketCanPort, lost_from
 from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import ActuatorSettings, CanSettings
-from tests.electrak_sim import Machine, SimulatedLoop, run_simulated
+from tests.electrak_sim import Machine, SimulatedLoop, run_simulated, until
 
 OURS = 231
 
@@ -255,17 +256,18 @@ async def slcan_machine(tmp_path: Path):  # type: ignore[no-untyped-def]
         await bus.close()
 
 
+def has(link: CanLink, condition: str) -> bool:
+    return condition in conditions(link)
+
+
 async def test_an_unplugged_adapter_is_noticed_at_once_and_used_again_when_it_is_back(tmp_path: Path) -> None:
     async with slcan_machine(tmp_path) as (bus, link, axis):
         bus.unplug()
-        await asyncio.sleep(0.1)
-        assert conditions(link) == {"unplugged"}
+        await until(lambda: conditions(link) == {"unplugged"}, 2.0)
         assert state(axis) is Lifecycle.FAILED
         await asyncio.sleep(0.3)
         bus.replug()
-        async with asyncio.timeout(4.0):
-            while state(axis) is not Lifecycle.STANDBY:
-                await asyncio.sleep(0.05)
+        await until(lambda: state(axis) is Lifecycle.STANDBY)
         assert conditions(link) == set()
 
 
@@ -273,10 +275,8 @@ async def test_state_lines_of_the_adapter_are_understood(tmp_path: Path) -> None
     async with slcan_machine(tmp_path) as (bus, link, _):
         for line, expected in ((b"sp130128", "error_passive"), (b"sb000256", "bus_off"), (b"e1o", "queue_overrun")):
             bus.send_adapter_line(line)
-            await asyncio.sleep(0.05)
-            assert expected in conditions(link)
+            await until(functools.partial(has, link, expected))
             bus.send_adapter_line(b"sa000000")
-            await asyncio.sleep(0.05)
         bus.send_adapter_line(b"T18FFgarbage")
         bus.send_adapter_line(b"\xff\x00?")
         await asyncio.sleep(0.05)
