@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -9,7 +10,7 @@ import cv2
 import numpy as np
 
 from graderd.core.blade import BladeGeometry, blade_coordinates
-from graderd.hal.camera import DepthImage
+from graderd.hal.camera import DepthImage, Intrinsics, StreamPose
 from graderd.perception.geometry import F64, U8, View, blade_points_m, face_setback_m
 
 MAX_FACE_POINTS_N = 700
@@ -54,6 +55,13 @@ def _in_blade(points: F64, view: View, angle_deg: float) -> tuple[F64, F64, F64]
     return s, d, at[:, 2]
 
 
+@functools.lru_cache(maxsize=4)
+def _optical_rays(lens: Intrinsics) -> F64:
+    """Ray of every pixel in the optical frame, scaled to Z = 1."""
+    still = StreamPose((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    return View(lens, still).rays().astype(np.float64)
+
+
 def collect_depth(
     depth_mm: DepthImage, view: View, blade: BladeGeometry, angle_deg: float, band_m: float
 ) -> DepthEvidence:
@@ -61,8 +69,7 @@ def collect_depth(
     lens = view.lens
     rows, columns = np.nonzero(depth_mm)
     z_optical = depth_mm[rows, columns].astype(np.float64) / 1000.0
-    flat = View(lens, view.pose).rays().astype(np.float64)[rows, columns] @ view.rotation  # optical rays again
-    points = flat * z_optical[:, None]
+    points = _optical_rays(lens)[rows, columns] * z_optical[:, None]
     s, d, z = _in_blade(points, view, angle_deg)
     half, top = blade.length_m / 2, blade.bottom_z_m + blade.height_m
     face = d - blade.x_offset_m + face_setback_m(blade, z)
