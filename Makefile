@@ -5,8 +5,12 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 ARGS   ?=
 PYTEST_ARGS ?=
+DEB_ARGS ?=
+HIL_ARGS ?=
+BENCH_ARGS ?=
+SOAK_S ?= 900
 
-.PHONY: help run test faults check format lock clean
+.PHONY: help run test faults deb hil soak hil-package bench-hw check format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -28,6 +32,26 @@ test: $(STAMP) ## run the tests
 
 faults: $(STAMP) ## inject every fault in every phase of work (ARGS="--short --json" for a part of it)
 	@$(BIN)/python -m tests.fault.campaign $(ARGS)
+
+deb: $(STAMP) ## build dist/graderd_VERSION_ARCH.deb (DEB_ARGS="--arch arm64"); needs dpkg-deb and git
+	@$(BIN)/python packaging/build_deb.py $(DEB_ARGS)
+
+hil: $(STAMP) ## hardware in the loop on a real kernel CAN stack (installs Debian packages once, as root)
+	@hil/setup
+	@$(MAKE) --no-print-directory deb
+	@PYTHONPATH=. $(BIN)/python -m hil.run $(HIL_ARGS)
+
+soak: $(STAMP) ## the soak alone, SOAK_S seconds of it
+	@hil/setup
+	@$(MAKE) --no-print-directory deb
+	@PYTHONPATH=. $(BIN)/python -m hil.run --part soak --soak-s $(SOAK_S)
+
+hil-package: $(STAMP) ## install, use, upgrade, purge the package in a clean Debian root (not in every CI run)
+	@hil/setup --usb
+	@PYTHONPATH=. $(BIN)/python -m hil.package $(HIL_ARGS)
+
+bench-hw: $(STAMP) ## tests against real hardware; asks before each motion (needs GRADERD_BENCH=1 and a terminal)
+	@PYTHONPATH=. $(BIN)/python -m hil.bench $(BENCH_ARGS)
 
 check: $(STAMP) ## lint, types, import contracts
 	@$(BIN)/ruff check .

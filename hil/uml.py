@@ -43,7 +43,7 @@ class LaunchError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Guest:
-    """What to run and with how much. ``memory_mib`` also holds everything the guest writes."""
+    """What to run, on which files (``root``), with how much; ``memory_mib`` also holds everything the guest writes."""
 
     command: Sequence[str]
     out: Path
@@ -51,6 +51,7 @@ class Guest:
     timeout_s: float = 600.0
     memory_mib: int = 3072
     kernel: Path = KERNEL
+    root: Path = Path("/")
     kernel_args: tuple[str, ...] = ()
 
     def run(self, *, follow: bool = True) -> int:
@@ -108,6 +109,7 @@ class Guest:
             "console=tty0",
             "quiet",
             "panic=-1",
+            f"hil_root={self.root}",
             f"hil_out={self.out.resolve()}",
             *self.kernel_args,
         ]

@@ -1,0 +1,63 @@
+#!/bin/sh
+# lifecycle.sh PACKAGE NEWER: the package's life in a guest that booted a clean root where apt has installed PACKAGE.
+# Prints a line per step; ends at the first that fails.
+set -eu
+package=$1 newer=$2
+step() { printf 'package: %s\n' "$*"; }
+fail() { printf 'package: FAILED: %s\n' "$*"; journalctl -u graderd --no-pager -n 40 || true; exit 1; }
+mode() { graderd status --json 2>/dev/null | python3 -c 'import json,sys; print(json.load(sys.stdin)["mode"])' || echo none; }
+until_mode() { # MODE SECONDS
+    for _ in $(seq "$2"); do [ "$(mode)" = "$1" ] && return 0; sleep 1; done
+    fail "not $1 after $2 s but $(mode)"
+}
+ready() {
+    for _ in $(seq 60); do graderd arm >/dev/null 2>&1 && return 0; sleep 1; done
+    fail "cannot be armed: $(graderd arm 2>&1)"
+}
+
+step "installed by apt in the clean root: $(dpkg-query -W graderd)"
+[ "$(systemctl is-active graderd)" = inactive ] || fail "it was started without being asked to"
+getent passwd graderd >/dev/null || fail "no user graderd"
+[ "$(stat -c '%U:%G %a' /etc/graderd)" = "root:graderd 770" ] || fail "rights of /etc/graderd"
+[ -r /usr/share/man/man1/graderd.1.gz ] && [ -r /usr/share/bash-completion/completions/graderd ] || fail "man, completion"
+[ -z "$(systemd-analyze verify --man=no graderd.service 2>&1)" ] || fail "systemd-analyze verify"
+
+step "asked for: started at once on the simulated grader"
+GRADERD_SIM=1 dpkg --configure --force-all graderd 2>/dev/null || GRADERD_SIM=1 dpkg -i --force-unsafe-io "$package" >/dev/null
+until_mode disarmed 60
+step "used: armed, blade turned"
+ready
+graderd manual >/dev/null 2>&1 || true
+graderd jog rotate =+10deg >/dev/null || fail "jog"
+
+step "an upgrade while armed is refused, and nothing has changed"
+pid=$(systemctl show --value -p MainPID graderd)
+if dpkg -i --force-unsafe-io "$newer" >/tmp/refused 2>&1; then fail "the upgrade went through while armed"; fi
+grep -q armed /tmp/refused || fail "no reason given: $(cat /tmp/refused)"
+[ "$(systemctl show --value -p MainPID graderd)" = "$pid" ] || fail "the daemon was restarted while armed"
+[ "$(dpkg-query -W -f '${Version}' graderd)" != 99.0.0 ] || fail "the version changed"
+graderd disarm >/dev/null
+until_mode disarmed 10
+
+step "an upgrade when disarmed keeps configuration and calibration, migrates an old file with a backup, restarts"
+sed -i 's/^version = .*/version = 0/; s/^\[rotation\]/[servo]/; s/^#zero_deg = .*/zero_deg = 7.25/' /etc/graderd/graderd.toml
+echo keep >/var/lib/graderd/recordings/pass-1
+cp /etc/graderd/graderd.toml /tmp/before.toml
+dpkg -i --force-unsafe-io "$newer" >/tmp/upgrade 2>&1 || fail "upgrade: $(tail -5 /tmp/upgrade)"
+until_mode disarmed 60
+[ "$(dpkg-query -W -f '${Version}' graderd)" = 99.0.0 ] || fail "version"
+grep -q '^zero_deg = 7.25' /etc/graderd/graderd.toml || fail "calibration lost"
+grep -q '^version = 1' /etc/graderd/graderd.toml || fail "not migrated: $(cat /tmp/upgrade)"
+cmp -s /tmp/before.toml /etc/graderd/graderd.toml.*.bak || fail "no backup of the former file"
+grep -q -- --sim /etc/default/graderd || fail "the choice of --sim was lost"
+
+step "purge leaves the recordings and nothing else"
+dpkg --purge graderd >/tmp/purge 2>&1 || fail "purge: $(cat /tmp/purge)"
+[ -f /var/lib/graderd/recordings/pass-1 ] || fail "the recording is gone"
+rm -r /var/lib/graderd
+left=$(find / -xdev -name '*graderd*' -not -path '/proc/*' -not -path '/sys/*' -not -path '/tmp/*' -not -path '/run/hil-out/*' \
+    -not -path '/var/log/*' -not -path '/var/cache/*' -not -path '/run/log/*' 2>/dev/null || true)
+[ -z "$left" ] || fail "left behind: $left"
+if getent passwd graderd >/dev/null || getent group graderd >/dev/null; then fail "user or group left behind"; fi
+systemctl list-unit-files --no-pager | grep -q graderd && fail "unit left behind"
+step "passed"
