@@ -79,8 +79,9 @@ def decide(
     """
     if not settled:
         return replace(decision, votes=()) if decision.votes else decision
-    votes = tuple(v for v in decision.votes if now_s - v.capture_s <= rule.vote_max_age_s)
-    if observation is not None and now_s - observation.capture_s <= rule.vote_max_age_s:
+    # A picture far ahead of the clock would never grow old: it counts as little as one far behind it.
+    votes = tuple(v for v in decision.votes if abs(now_s - v.capture_s) <= rule.vote_max_age_s)
+    if observation is not None and abs(now_s - observation.capture_s) <= rule.vote_max_age_s:
         votes = (*votes, observation)[-rule.votes_window_n :]
     decision = replace(decision, votes=votes)
     if now_s - decision.decided_s < rule.dwell_s:
