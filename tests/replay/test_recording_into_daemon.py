@@ -44,7 +44,7 @@ def _record(directory: Path, path: Path) -> None:
     camera.open()
     frames = [camera.read(5.0) for _ in range(FRAMES_N)]
     camera.close()
-    soft = SoftD455((640, 400), (424, 240), (314.5425, 213.8375))
+    soft = SoftD455((640, 400), (424, 240))
     record(path, [(frame.color_bgr, frame.depth_mm) for frame in frames], soft)
 
 
