@@ -18,6 +18,7 @@ from drivers.electrak import CanLink, ElectrakActuator
 from drivers.electrak.bus_events import BusEvent, event_of
 from drivers.electrak.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
 from drivers.electrak.ports import PortLostError, SocketCanPort, lost_from
+from drivers.electrak.slcan_bus import QuietSlcanBus
 from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import ActuatorSettings, CanSettings
@@ -363,3 +364,22 @@ def test_raw_frames_are_read_straight_from_the_socket() -> None:
     port.close()
     with pytest.raises(PortLostError):
         port.read()
+
+
+async def test_a_host_that_does_not_read_loses_whole_frames_and_never_half_of_one(tmp_path: Path) -> None:
+    bus = VirtualActuatorBus([], link=tmp_path / "can")
+    await bus.start()
+    host = QuietSlcanBus(str(tmp_path / "can"), 250_000)
+    await asyncio.sleep(0.05)
+    for index in range(3000):
+        bus.send(Frame(make_id(6, 0xFF00, 0x33), index.to_bytes(8, "little")))
+    seen = []
+    for _ in range(3000):
+        message = host.recv(0)
+        if message is not None:
+            assert message.dlc == 8
+            seen.append(int.from_bytes(message.data, "little"))
+    assert len(seen) > 50
+    assert seen == sorted(set(seen))
+    host.shutdown()
+    await bus.close()

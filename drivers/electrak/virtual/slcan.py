@@ -31,6 +31,7 @@ class SlcanAdapter:
         self._open = False
         self._listen_only = False
         self._line = bytearray()
+        self._unsent = b""
         self._deaf = False
         self._bitrate_code = b""
         self.dropped_n = 0
@@ -74,6 +75,7 @@ class SlcanAdapter:
         os.close(self._slave_fd)
         self._master_fd = self._slave_fd = -1
         self._open = False
+        self._unsent = b""
         self._line.clear()
         with contextlib.suppress(FileNotFoundError):
             self._link.unlink()
@@ -94,14 +96,25 @@ class SlcanAdapter:
         self._write(line + _OK)
 
     def _write(self, data: bytes) -> None:
+        """Hand a whole line to the host, or none of it where its buffer is full; a line begun is finished first."""
         if not self.plugged:
             return
-        try:
-            written = os.write(self._master_fd, data)
-        except BlockingIOError:
-            written = 0
-        if written < len(data):
+        if self._unsent:
+            self._unsent = self._unsent[self._try_to_write(self._unsent) :]
+        if self._unsent:
             self.dropped_n += 1
+            return
+        written_n = self._try_to_write(data)
+        if written_n == 0:
+            self.dropped_n += 1
+        else:
+            self._unsent = data[written_n:]
+
+    def _try_to_write(self, data: bytes) -> int:
+        try:
+            return os.write(self._master_fd, data)
+        except BlockingIOError:
+            return 0
 
     def _on_frame(self, frame: Frame) -> None:
         if not self._open:
