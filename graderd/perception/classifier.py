@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import OrderedDict
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -41,14 +40,6 @@ class Classifier(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Regions:
-    """The blade's region of one picture size and angle, at full scale and at the fast scale."""
-
-    full: Region
-    fast: Region
-
-
 class SoilClassifier:
     """The one implementation; ``settings.method`` chooses what it does with a healthy frame."""
 
@@ -68,7 +59,7 @@ class SoilClassifier:
         self._health = HealthMonitor(settings.health, live, camera)
         self._views: dict[tuple[str, Intrinsics], View] = {}
         self._judges: dict[Intrinsics, DepthJudge] = {}
-        self._regions: OrderedDict[tuple[object, ...], _Regions | None] = OrderedDict()
+        self._regions: OrderedDict[tuple[object, ...], Region | None] = OrderedDict()
 
     @property
     def settings(self) -> PerceptionSettings:
@@ -130,7 +121,7 @@ class SoilClassifier:
             self._views[key] = View(lens, calibrated.pose(self._calibration.mounting))
         return self._views[key]
 
-    def _region(self, frame: Frame, angle_deg: float) -> _Regions | None:
+    def _region(self, frame: Frame, angle_deg: float) -> Region | None:
         height, width = frame.color_bgr.shape[:2]
         view = self.color_view(frame)
         step = round(angle_deg / ANGLE_STEP_DEG)
@@ -138,19 +129,16 @@ class SoilClassifier:
         if key in self._regions:
             self._regions.move_to_end(key)
             return self._regions[key]
-        halvings = 2 if width >= 1000 else 1 if width >= 500 else 0
-        regions: _Regions | None = None
+        # The paper's letter works on the full picture; what else needs the region is content with its corners.
+        halvings = 0 if self._settings.method == "paper" or width < 500 else 2 if width >= 1000 else 1
         if view is None:
-            mirrored = drawing.image_right_is_left(self._mounting)
-            full, fast = (image_thirds(width, height, n, mirrored) for n in (0, halvings))
+            region = image_thirds(width, height, halvings, drawing.image_right_is_left(self._mounting))
         else:
-            full, fast = (blade_region(view, self._blade, step * ANGLE_STEP_DEG, n) for n in (0, halvings))
-        if full is not None and fast is not None:
-            regions = _Regions(full, fast)
-        self._regions[key] = regions
+            region = blade_region(view, self._blade, step * ANGLE_STEP_DEG, halvings)
+        self._regions[key] = region
         if len(self._regions) > KEPT_REGIONS_N:
             self._regions.popitem(last=False)
-        return regions
+        return region
 
     def _depth_judge(self, frame: Frame) -> DepthJudge | None:
         view = self.depth_view(frame)
@@ -162,20 +150,18 @@ class SoilClassifier:
 
     def _judge(self, frame: Frame, angle_deg: float) -> tuple[Verdict, list[PictureFault]]:
         settings = self._settings
-        regions = self._region(frame, angle_deg)
-        if regions is None:
+        region = self._region(frame, angle_deg)
+        if region is None:
             return Verdict(
                 Zone.UNKNOWN, 0.0, "the blade is not in the picture at this angle, or the picture is too small"
             ), []
-        faults = self._health.blurred(frame.color_bgr, regions.full)
+        faults = self._health.blurred(frame.color_bgr, region)
         if faults:
             return Verdict(Zone.UNKNOWN, 0.0, ""), faults
         if settings.method == "paper":
-            return self._said(
-                frame, paper_verdict(frame.color_bgr, regions.full, settings.color, settings.decision)
-            ), []
+            return self._said(frame, paper_verdict(frame.color_bgr, region, settings.color, settings.decision)), []
         if settings.method == "fast_color":
-            verdict = fast_color_verdict(frame.color_bgr, regions.fast, settings.color, settings.decision)
+            verdict = fast_color_verdict(frame.color_bgr, region, settings.color, settings.decision)
             return self._said(frame, verdict), []
         judge = self._depth_judge(frame)
         if judge is None or frame.depth_mm is None:
@@ -185,7 +171,7 @@ class SoilClassifier:
         faults = self._health.knocked(soil.ground, soil.blade, settings.depth)
         if settings.method == "depth" or faults:
             return by_depth, faults
-        by_color = fast_color_verdict(frame.color_bgr, regions.fast, settings.color, settings.decision)
+        by_color = fast_color_verdict(frame.color_bgr, region, settings.color, settings.decision)
         return fuse(by_depth, by_color), []
 
     def _said(self, frame: Frame, verdict: Verdict) -> Verdict:
