@@ -300,3 +300,13 @@ class Rig:
             "camera.source": "rig",
             "camera.path": str(RIG_DIRECTORY / "camera.sock"),
         }
+
+
+def turn(grader: Grader, rig: Rig, to_deg: float = 45.0) -> None:
+    """In automatic, blade at rest on one side, then soil that sends it to the other; returns while it turns."""
+    zone, back_to = ("even", -30.0) if to_deg > 0 else ("right", 45.0)
+    grader.arm("auto")
+    rig.ask("scene", zone="right" if to_deg > 0 else "even", seed=5)
+    grader.wait("at the other end", lambda s: abs(s["axes"]["rotation"]["measured"] - back_to) < 1.0, 40.0)
+    rig.ask("scene", zone=zone, seed=6)
+    grader.wait("turning", lambda s: abs(s["axes"]["rotation"]["velocity_per_s"] or 0) > 5.0, 40.0)

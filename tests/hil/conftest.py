@@ -40,7 +40,10 @@ FOR_THE_GUEST: dict[str, object] = {
     "camera.color_height_px": 400,
     "camera.depth_width_px": 424,
     "camera.depth_height_px": 240,
-    "camera.rate_hz": 3.0,
+    "camera.rate_hz": 2.0,
+    "camera.stale_s": 3.0,
+    "camera.restart_s": 10.0,
+    "machine.lease_s": 1.0,
 }
 
 
@@ -50,6 +53,13 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "restarts(n): systemd restarts the service so often during the test")
     config.addinivalue_line("markers", "soak: the long run with faults")
     config.addinivalue_line("markers", "shutdown: leaves the machine as it is, for the shutdown that follows")
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Write each failure down as it happens: a guest that dies later takes the summary with it."""
+    if report.failed and "HIL_OUT" in os.environ:
+        with Path(os.environ["HIL_OUT"], "failures").open("a", encoding="utf-8") as out:
+            out.write(f"{report.nodeid} ({report.when}, {report.duration:.1f} s)\n{report.longreprtext}\n\n")
 
 
 def pytest_report_header() -> list[str]:
@@ -91,7 +101,8 @@ def service(rig: Rig) -> Iterator[Grader]:
     # The guest has one processor: the drop-in we ship for that. And its page faults are slow: keep memory once taken.
     (DROP_IN / "realtime.conf").write_bytes(Path("/usr/share/graderd/dropins/realtime.conf").read_bytes())
     (DROP_IN / "hil.conf").write_text(
-        "[Service]\nTimeoutStopSec=40\nEnvironment=MALLOC_TRIM_THRESHOLD_=1000000000 MALLOC_MMAP_THRESHOLD_=1000000000\n", encoding="utf-8"
+        "[Service]\nTimeoutStopSec=40\nEnvironment=MALLOC_TRIM_THRESHOLD_=1000000000 MALLOC_MMAP_THRESHOLD_=1000000000\n",
+        encoding="utf-8",
     )
     grader = Grader()
     grader.configure(rig.configuration() | FOR_THE_GUEST | {"can.channel": CAN})

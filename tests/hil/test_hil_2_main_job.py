@@ -7,9 +7,11 @@ import json
 import pytest
 
 from hil.bus import RawBus
-from hil.service import Grader, Rig, faults
+from hil.service import Grader, Rig, faults, turn
 
-AFTER_S = 25.0
+AFTER_S = 30.0
+
+pytestmark = pytest.mark.timeout(240)
 
 
 def test_soil_turns_the_blade(ready: Grader, rig: Rig) -> None:
@@ -54,9 +56,7 @@ def test_a_jog_is_refused_when_not_in_manual(ready: Grader) -> None:
 
 
 def test_stop_on_the_command_line_latches(ready: Grader, rig: Rig) -> None:
-    ready.arm("auto")
-    rig.ask("scene", zone="left", seed=4)
-    ready.wait("turning", lambda s: s["axes"]["rotation"]["moving"], 15.0)
+    turn(ready, rig)
     ready.cli("stop", "--reason", "person near the blade")
     state = ready.wait("standing", lambda s: not s["axes"]["rotation"]["moving"], 3.0)
     assert state["mode"] == "stopped"

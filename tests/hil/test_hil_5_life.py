@@ -8,21 +8,13 @@ import time
 import pytest
 
 from hil.bus import RawBus
-from hil.service import Grader, Rig, wait_for
+from hil.service import Grader, Rig, turn, wait_for
 
 WATCHDOG_S = 2.0
 STANDS_WITHIN_S = 1.0
 ACM = 0xEF00
 
-
-def turn(grader: Grader, rig: Rig, to_deg: float = 45.0) -> None:
-    """In automatic, blade at rest on one side, then soil that sends it to the other; returns while it turns."""
-    zone, back_to = ("even", -30.0) if to_deg > 0 else ("right", 45.0)
-    grader.arm("auto")
-    rig.ask("scene", zone="right" if to_deg > 0 else "even", seed=5)
-    grader.wait("at the other end", lambda s: abs(s["axes"]["rotation"]["measured"] - back_to) < 1.0, 25.0)
-    rig.ask("scene", zone=zone, seed=6)
-    grader.wait("turning", lambda s: abs(s["axes"]["rotation"]["velocity_per_s"] or 0) > 5.0, 20.0)
+pytestmark = pytest.mark.timeout(240)
 
 
 def stands(rig: Rig, within_s: float) -> float:

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.service import Grader, Rig, run
-from tests.hil.test_hil_5_life import turn
+from hil.service import Grader, Rig, run, turn
 
 OUT = Path(os.environ.get("HIL_OUT", "/tmp"))
 
