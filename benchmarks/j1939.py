@@ -2,7 +2,8 @@
 
 ``python benchmarks/j1939.py [--seconds N] [--json]``. The three are measured in one run on one machine; the period
 measurement runs graderd and can-j1939 at the same time, each in a process and on an slcan adapter of its own, with the
-same 800 frames a second coming in. Exit status 1 where a
+same 800 frames a second coming in (run it on a machine that is otherwise quiet: the tail of the period error is the
+machine's where its cores are taken). Exit status 1 where a
 bar is missed: ahead of can-j1939 everywhere, and no more than a fifth behind bare cantools as a codec.
 """
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import cantools.database
 from cantools.database.can import Database, Message
@@ -27,8 +27,7 @@ FLAGS: Final = ("overload", "backdrive", "parameter", "saturation", "fatal")
 """One-bit flags of the feedback message; names as in the telemetry contract."""
 
 
-@dataclass(frozen=True, slots=True)
-class Control:
+class Control(NamedTuple):
     """Content of one actuator control message (ACM)."""
 
     target_mm: float
@@ -37,8 +36,7 @@ class Control:
     motion_enable: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Feedback:
+class Feedback(NamedTuple):
     """Content of one actuator feedback message (AFM).
 
     ``flags``: those that are set, of :data:`FLAGS` and ``voltage_low``, ``voltage_high``, ``temperature_low``,
