@@ -101,7 +101,8 @@ def service(rig: Rig) -> Iterator[Grader]:
     # The guest has one processor: the drop-in we ship for that. And its page faults are slow: keep memory once taken.
     (DROP_IN / "realtime.conf").write_bytes(Path("/usr/share/graderd/dropins/realtime.conf").read_bytes())
     (DROP_IN / "hil.conf").write_text(
-        "[Service]\nTimeoutStopSec=40\nEnvironment=MALLOC_TRIM_THRESHOLD_=1000000000 MALLOC_MMAP_THRESHOLD_=1000000000\n",
+        "[Service]\nTimeoutStopSec=40\nEnvironment=MALLOC_TRIM_THRESHOLD_=1000000000\n"
+        "Environment=MALLOC_MMAP_THRESHOLD_=1000000000\n",
         encoding="utf-8",
     )
     grader = Grader()
