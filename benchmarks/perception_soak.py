@@ -89,13 +89,10 @@ def soak(frames: Iterator[Frame], count: int) -> bool:
     tenth = max(1, len(memory_mb) // 10)
     early, end = float(np.median(memory_mb[tenth : 2 * tenth + 1])), float(np.median(memory_mb[-tenth:]))
     growth = (end / early - 1) * 100
-    print(
-        f"{count} frames ({count / RATE_HZ / 60:.0f} min at 30 Hz) in {wall_s:.0f} s, {cpu_s / count * 1000:.2f} ms CPU each"
-    )
+    minutes, each_ms = count / RATE_HZ / 60, cpu_s / count * 1000
+    print(f"{count} frames ({minutes:.0f} min at 30 Hz) in {wall_s:.0f} s, {each_ms:.2f} ms CPU each with making them")
     print("zones: " + ", ".join(f"{zone} {n}" for zone, n in zones.items() if n))
-    print(
-        f"memory: {early:.1f} MB after a tenth, {end:.1f} MB at the end ({growth:+.1f} %), at most {max(memory_mb):.1f}"
-    )
+    print(f"memory: {early:.1f} MB early, {end:.1f} MB at the end ({growth:+.1f} %), at most {max(memory_mb):.1f}")
     print(f"oldest frame judged: {oldest_judged_s * 1000:.0f} ms; late frames that gave a zone: {late_judged}")
     bars = {"memory within 5 %": abs(growth) <= 5.0, "no frame older than 100 ms used": oldest_judged_s <= 0.1}
     bars["late frames never give a zone"] = late_judged == 0

@@ -2,7 +2,7 @@
 
 Colour, light, wetness and rust do not enter. One frame: every n-th pixel becomes a point in the vehicle frame; ground
 and blade are found again (:mod:`graderd.perception.registration`); points in front of the face fill a height map
-in blade coordinates; what the crest hides from the camera is filled with a slope at the angle of repose; heights above
+in blade coordinates; what a crest hides from the camera is filled with a slope at the angle of repose; heights above
 the noise add up to litres.
 """
 
@@ -170,7 +170,7 @@ class DepthJudge:
         height = np.divide(total, count, out=np.zeros(size), where=count > 0).reshape(seen.shape)
         slope = np.tan(np.radians((settings.steepest_deg, settings.repose_deg))) * self._cell_d_m
         seen = without_steep(height, seen, float(slope[0]))
-        filled = fill_hidden(height, seen, float(slope[1]))[:, : self._ahead_n]
+        filled = fill_hidden(height, seen, float(slope[1]), float(slope[0]))[:, : self._ahead_n]
         seen = seen[:, : self._ahead_n]
         distance = 0.9
         expected = settings.disparity_noise_px * distance**2 / (self._focal_px * settings.baseline_m)
@@ -190,28 +190,30 @@ class DepthJudge:
 
 
 def without_steep(height: F64, seen: Bools, rise_per_cell: float) -> Bools:
-    """Which seen cells are ground or soil: hoses, rods and legs rise steeper out of what is seen beside them.
-
-    The bound is the lower envelope of cones of slope ``rise_per_cell`` on every seen cell (along the cells' two
-    directions, so that it can be run up with four accumulations).
-    """
-    bound = np.where(seen, height, UNSEEN)
-    for axis in (0, 1):
-        steps = rise_per_cell * np.arange(height.shape[axis])
-        steps = steps[:, None] if axis == 0 else steps[None, :]
-        up = np.minimum.accumulate(bound - steps, axis=axis) + steps
-        down = np.flip(np.minimum.accumulate(np.flip(bound + steps, axis), axis=axis), axis) - steps
-        bound = np.minimum(up, down)
+    """Which seen cells are ground or soil: hoses, rods and legs rise steeper out of what is seen beside them."""
+    bound = _lower_cones(np.where(seen, height, UNSEEN), rise_per_cell, rise_per_cell)
     return np.asarray(seen & (height <= bound + STEEP_TOLERANCE_M))
 
 
-def fill_hidden(height: F64, seen: Bools, drop_per_cell: float) -> F64:
-    """Heights with the unseen cells filled along d: falling by ``drop_per_cell`` each cell from the seen on both sides.
+def fill_hidden(height: F64, seen: Bools, drop_per_cell: float, aside_per_cell: float) -> F64:
+    """Heights with the unseen cells filled from what is seen on any side: the least that can lie behind a crest.
 
-    The steepest fall that soil holds gives the least that can lie there.
+    They fall by ``drop_per_cell`` each cell along d, at the angle of repose, and by the steeper ``aside_per_cell``
+    along the blade: what a heap hides of the third beside it must not be filled up with a heap of guesses.
     """
-    fall = drop_per_cell * np.arange(height.shape[1])
-    known = np.where(seen, height, -UNSEEN)
-    ahead = np.maximum.accumulate((known - fall)[:, ::-1], axis=1)[:, ::-1] + fall
-    back = np.maximum.accumulate(known + fall, axis=1) - fall
-    return np.where(seen, height, np.maximum(np.maximum(ahead, back), 0.0))
+    least = -_lower_cones(np.where(seen, -height, UNSEEN), aside_per_cell, drop_per_cell)
+    return np.where(seen, height, np.maximum(least, 0.0))
+
+
+def _lower_cones(height: F64, rise_s_per_cell: float, rise_d_per_cell: float) -> F64:
+    """The lower envelope of upward cones standing on every cell, of these slopes along s and d.
+
+    Distances run along the two directions of the cells, so that four accumulations give it.
+    """
+    for axis, rise_per_cell in enumerate((rise_s_per_cell, rise_d_per_cell)):
+        steps = rise_per_cell * np.arange(height.shape[axis])
+        steps = steps[:, None] if axis == 0 else steps[None, :]
+        up = np.minimum.accumulate(height - steps, axis=axis) + steps
+        down = np.flip(np.minimum.accumulate(np.flip(height + steps, axis), axis=axis), axis) - steps
+        height = np.minimum(up, down)
+    return height

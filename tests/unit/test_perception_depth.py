@@ -106,5 +106,5 @@ def test_same_picture_same_answer() -> None:
 def test_hidden_cells_fall_from_the_crest() -> None:
     height = np.array([[0.0, 0.0, 0.0, 0.10, 0.05]])
     seen = np.array([[False, False, False, True, True]])
-    filled = fill_hidden(height, seen, 0.03)
+    filled = fill_hidden(height, seen, 0.03, 0.06)
     assert filled[0] == pytest.approx([0.01, 0.04, 0.07, 0.10, 0.05])

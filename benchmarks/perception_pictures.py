@@ -1,0 +1,97 @@
+"""Draws the pictures of docs/operators/perception.md: ``python -m benchmarks.perception_pictures``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from drivers.rig.blade import BladePose
+from drivers.rig.ground import SceneState
+from drivers.rig.look import Look
+from drivers.rig.piles import SceneZone
+from drivers.rig.renderer import Renderer
+from drivers.rig.soil import SoilField
+from drivers.rig.world import scene_heights
+from graderd.core.blade import BladeGeometry
+from graderd.hal.camera import Frame
+from graderd.perception import CameraCalibration, PerceptionSettings
+from graderd.perception.annotate import text_on
+from graderd.perception.classifier import SoilClassifier
+from graderd.perception.color import paper_steps
+from graderd.perception.geometry import U8
+
+OUT = Path("docs/pictures")
+ANGLE_DEG = 20.0
+SIZE = (480, 300)
+
+
+def photograph(look: Look) -> Frame:
+    """A left heap before a turned blade."""
+    renderer = Renderer((1280, 800), (848, 480), seed=7)
+    pose = BladePose(ANGLE_DEG)
+    heights = scene_heights(SceneZone.LEFT, 3.0, pose, 7).astype(np.float32)
+    color, depth = renderer.render(SceneState(heights, SoilField().cell_m, 3.0, pose), look)
+    return Frame(color, depth, renderer.color_intrinsics, renderer.depth_intrinsics, 0.0, 1, 1)
+
+
+def titled(picture: U8, title: str) -> U8:
+    """Scaled to one size, with a title."""
+    small = cv2.resize(picture, SIZE, interpolation=cv2.INTER_AREA)
+    if small.ndim == 2:
+        small = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
+    drawn = np.asarray(small, dtype=np.uint8)
+    text_on(drawn, title, (10, SIZE[1] - 12), 0.5)
+    return drawn
+
+
+def save(name: str, pictures: list[U8]) -> None:
+    """Side by side."""
+    cv2.imwrite(str(OUT / name), np.hstack(pictures), [cv2.IMWRITE_JPEG_QUALITY, 82])
+
+
+def main() -> None:
+    """Write all pictures."""
+    blade, calibration = BladeGeometry(), CameraCalibration()
+    brown = photograph(Look(soil="loam", ground="concrete", blade="steel"))
+    paper = SoilClassifier(PerceptionSettings(method="paper"), calibration, blade, live=False)
+    filtered, mask, contour = paper_steps(brown.color_bgr, PerceptionSettings().color)
+    said = paper.classify(brown, ANGLE_DEG, 0.0)
+    save(
+        "perception-paper.jpg",
+        [
+            titled(filtered, "brightness, bilateral filter"),
+            titled(np.asarray(cv2.bitwise_and(filtered, filtered, mask=mask), dtype=np.uint8), "hue window, Otsu"),
+            titled(contour, "largest contour"),
+            titled(paper.annotate(brown, said), "area per third"),
+        ],
+    )
+    hard = photograph(Look(soil="gravel", ground="plywood", blade="rusty", red_cast=0.25))
+    fused = SoilClassifier(PerceptionSettings(), calibration, blade, live=False)
+    soil = fused.height_map(hard, ANGLE_DEG)
+    assert soil is not None
+    assert hard.depth_mm is not None
+    shade = np.clip(hard.depth_mm / 1700 * 255, 0, 255).astype(np.uint8)
+    depth = np.asarray(cv2.applyColorMap(shade, cv2.COLORMAP_TURBO), dtype=np.uint8)
+    depth[hard.depth_mm == 0] = 0
+    map_mm = np.clip(soil.height_m.T * 1000, 0, 250)  # the operator's right at the left, as in the picture
+    tall = cv2.resize((map_mm / 250 * 255).astype(np.uint8), SIZE, interpolation=cv2.INTER_NEAREST)
+    hidden = cv2.resize((~soil.seen.T).astype(np.uint8), SIZE, interpolation=cv2.INTER_NEAREST)
+    plan = np.asarray(cv2.applyColorMap(tall, cv2.COLORMAP_VIRIDIS), dtype=np.uint8)
+    plan[(hidden > 0) & (np.indices(hidden.shape).sum(axis=0) % 6 < 2)] = 255
+    said = fused.classify(hard, ANGLE_DEG, 0.0)
+    wrong = SoilClassifier(PerceptionSettings(method="fast_color"), calibration, blade, live=False)
+    save(
+        "perception-depth.jpg",
+        [
+            titled(depth, "depth picture"),
+            titled(plan, "height map from above; hatched: filled in"),
+            titled(fused.annotate(hard, said), "fused"),
+            titled(wrong.annotate(hard, wrong.classify(hard, ANGLE_DEG, 0.0)), "fast_color on the same frame"),
+        ],
+    )
+
+
+if __name__ == "__main__":
+    main()
