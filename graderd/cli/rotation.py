@@ -1,4 +1,4 @@
-"""``graderd rotation reboot | step``: services of the servo that turns the blade."""
+"""``graderd rotation reboot | confirm-turns | step``: services of the servo that turns the blade."""
 
 from __future__ import annotations
 
@@ -34,6 +34,19 @@ def register(app: typer.Typer) -> None:
             print_json(answer)
         else:
             print_text("the servo has restarted; arm when its alerts are gone")
+
+    @rotation.command(epilog=example("graderd rotation confirm-turns --yes"))
+    def confirm_turns(context: typer.Context, yes: Yes = False, json: Json = False) -> None:
+        """Say that the angle shown is the blade's, after whole turns were lost.
+
+        Look at the blade and compare it with the angle of 'graderd status' first. Disarmed only.
+        """
+        need_consent("rotation confirm-turns", "the angle shown is taken for the blade's", yes)
+        answer = daemon_of(context).service("rotation.confirm_turns", SERVICE_S, consent=True)
+        if json:
+            print_json(answer)
+        else:
+            print_text("taken; arm when the area around the blade is clear")
 
     @rotation.command(epilog=example("graderd rotation step --by-deg 10 --report step.html --yes"))
     def step(

@@ -101,7 +101,8 @@ ROWS = (
         "rotation.turns_lost",
         "the blade servo lost count of its turns: the blade's angle may be wrong by whole turns of the servo",
         "a restart of the servo while it stood outside one turn",
-        "bring the blade near square by hand, compare its angle with the one shown, correct zero_deg; then arm",
+        "compare the blade with the angle shown (if they differ: bring it near square by hand, reboot the servo), "
+        "'graderd rotation confirm-turns'; then arm",
         Reaction.DISARM,
         clear=Clear.ON_REARM,
     ),

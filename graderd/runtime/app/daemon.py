@@ -19,6 +19,7 @@ from graderd.core import commands as cmd
 from graderd.core.machine import Mode
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
+from graderd.runtime.app.adapter_watch import AdapterWatch
 from graderd.runtime.app.devices import build_devices, build_stop_input
 from graderd.runtime.app.services import build_services
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
@@ -91,7 +92,7 @@ class Daemon:
         self._port = Port(self._loop, self._eyes, build_services(config, rotator, self._loop, self._eyes))
         self._recorder = Recorder(config)
         self._health = HealthWatch(config)
-        self._loop.extra_faults += [self._recorder.faults, self._health.faults]
+        self._loop.extra_faults += [AdapterWatch(rotator).faults, self._recorder.faults, self._health.faults]
         self._stop_input = build_stop_input(config, clock, on_stop=self._stop_from_input)
         if self._stop_input is not None:
             self._loop.extra_faults.append(self._stop_input.faults)

@@ -54,6 +54,10 @@ def build_services(
         await rotator.reboot()
         return {"rebooted": True}
 
+    async def confirm_turns(_: dict[str, Any]) -> dict[str, Any]:
+        rotator.confirm_turns()
+        return {"confirmed": True}
+
     async def step_response(arguments: dict[str, Any]) -> dict[str, Any]:
         wanted = _checked(StepArguments, arguments)
         return await _step_response(config, rotator, loop, wanted)
@@ -65,6 +69,7 @@ def build_services(
     return {
         "rotation.verify_profile": verify_profile,
         "rotation.reboot": reboot,
+        "rotation.confirm_turns": confirm_turns,
         "rotation.step_response": step_response,
         "camera.calibrate": calibrate,
     }
