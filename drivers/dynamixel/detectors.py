@@ -130,7 +130,10 @@ class MotionDetectors:
             self._opposed_allowed_s = 1.2 * stopping_s + _WRONG_WAY_S
         lasted_s = s.time_s - self._opposed_since_s
         away_deg = abs(s.angle_deg - self._opposed_from_deg)
-        if lasted_s > self._opposed_allowed_s and away_deg > _WRONG_WAY_DEG:
+        # No permitted speed takes so far to brake: a runaway is not given the time that braking would take.
+        st = self._settings
+        most_deg = 1.5 * st.velocity_deg_per_s**2 / (2.0 * st.acceleration_deg_per_s2) + _WRONG_WAY_DEG
+        if (lasted_s > self._opposed_allowed_s and away_deg > _WRONG_WAY_DEG) or away_deg > most_deg:
             detail = f"turning away from the goal for {lasted_s:.2f} s ({away_deg:.1f}°), {error_deg:+.1f}° to go"
             self._note(s, "wrong_way", detail)
 

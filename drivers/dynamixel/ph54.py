@@ -45,6 +45,9 @@ _HEALTH_EVERY_S = 0.1
 _GOALS_EVERY_S = 0.5
 _RECONNECT_FIRST_S = 0.1
 _RECONNECT_MOST_S = 1.0
+_RUNAWAY_DEG = 8.0
+"""Braking from the fastest permitted turn takes 5.2 degrees. A blade that goes further under a hold is not braking: its
+servo runs the wrong way, and a goal, even that of staying, only drives it on."""
 _STOP_S = 0.5
 """A disarm gives the blade so long to come to rest before torque goes off."""
 _STILL_READS_N = 5
@@ -220,11 +223,15 @@ class Ph54Rotator:
             self._command.hold()
             loop = asyncio.get_running_loop()
             until_s, still_n = loop.time() + _STOP_S, 0
+            began = self._observer.telemetry.angle_deg
             while loop.time() < until_s and still_n < _STILL_READS_N:
                 await self._tolerant(self._send_command(device))
                 await self._tolerant(self._observer.read_telemetry(device, None))
-                speed = self._observer.telemetry.velocity_deg_per_s
+                speed, angle = self._observer.telemetry.velocity_deg_per_s, self._observer.telemetry.angle_deg
                 still_n = still_n + 1 if speed is not None and abs(speed.value) < 1.0 else 0
+                if off and began is not None and angle is not None and abs(angle.value - began.value) > _RUNAWAY_DEG:
+                    log.warning("%s: does not obey the hold: torque off without waiting for rest", DEVICE)
+                    break
             if off:
                 await self._torque_off(device)
                 self._torque_is_ours = False

@@ -105,6 +105,13 @@ class ActuatorFault(_Command):
     params: Params = {}
 
 
+class TurnBlade(_Command):
+    """Somebody turns the unpowered blade by hand."""
+
+    cmd: Literal["turn_blade"]
+    angle_deg: Number = Field(ge=-90, le=90)
+
+
 class CanFrame(_Command):
     """Put a message of some other node on the actuators' bus."""
 
@@ -170,6 +177,7 @@ Command = Annotated[
     | CameraFault
     | ServoFault
     | ActuatorFault
+    | TurnBlade
     | CanFrame
     | StopLoopState
     | ClearFaults

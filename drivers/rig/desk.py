@@ -121,6 +121,8 @@ class Desk:
                 machine.inject_servo_fault(command.name, command.params)
             case commands.ActuatorFault():
                 machine.inject_actuator_fault(command.name, command.device, command.params)
+            case commands.TurnBlade():
+                machine.turn_blade(command.angle_deg)
             case commands.CanFrame():
                 machine.send_frame(command.can_id, bytes.fromhex(command.data_hex))
             case commands.StopLoopState():

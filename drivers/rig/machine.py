@@ -109,6 +109,16 @@ class Machine:
             self.actuator_bus.inject(name, address=None if device is None else _ADDRESSES[device], **rest)
         self.actuator_faults[name] = dict(params)
 
+    def turn_blade(self, angle_deg: float) -> None:
+        """Somebody turns the blade by hand.
+
+        Raises:
+            ValueError: the servo holds it.
+        """
+        if self.servo.torque_enabled:
+            raise ValueError("the servo's torque holds the blade; disarm first")
+        self.servo.shaft_deg = angle_deg
+
     def send_frame(self, can_id: int, data: bytes) -> None:
         """A message of some other node on the actuators' bus (29-bit identifier)."""
         self.actuator_bus.send(Frame(can_id, data))

@@ -279,6 +279,9 @@ async def recover(stack: Stack, case: Case, outcome: Outcome, before: str) -> No
             await asyncio.sleep(LATCHED_S)
             if outcome.detected and not _named(await stack.read_status() or {}, case.faults):
                 raise CampaignError(f"{case.faults[0]} went away by itself; the catalogue says: {row.clear}")
+        if case.before_arm is not None:
+            await case.before_arm(stack)
+            way.append("what the remedy says")
         if mode == "stopped":
             if (await stack.command("arm"))["accepted"]:
                 raise CampaignError("armed without a reset after a stop")
@@ -288,9 +291,6 @@ async def recover(stack: Stack, case: Case, outcome: Outcome, before: str) -> No
         elif mode != "disarmed" and row.clear is not Clear.WHEN_GONE:
             await stack.command("disarm")
             way.append("disarm")
-        if case.before_arm is not None:
-            await case.before_arm(stack)
-            way.append("reboot the servo")
         if mode in ("stopped", "disarmed") or way:
             await _retry(stack, "arm", case.recover_s)
             await stack.until_status(lambda s: s["mode"] == "manual", 6.0, "not armed again")

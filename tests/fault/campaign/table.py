@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 from contextlib import suppress
 from typing import Any
 
+from graderd.hal.errors import DeviceError
 from tests.fault.campaign.model import ROTATION, Action, Case, Phase
 from tests.fault.campaign.stack import Stack
 
@@ -63,6 +65,14 @@ async def thaw(stack: Stack) -> None:
 async def reboot(stack: Stack) -> None:
     """What the remedy of a hardware alert asks for."""
     await stack.service("rotation.reboot", consent=True)
+
+
+async def put_back(stack: Stack) -> None:
+    """A runaway may end outside the limits: the blade is turned back by hand, and the overloaded servo rebooted."""
+    await asyncio.sleep(1.0)
+    with suppress(DeviceError):
+        await stack.ask_rig("turn_blade", angle_deg=0.0)
+    await reboot(stack)
 
 
 def _camera(name: str, text: str, fault: str, inject: Action, **more: Any) -> Case:
@@ -123,11 +133,11 @@ SERVO = (
     _servo("jam", "the shaft is blocked", "not_moving", servo("jam"), needs="rotation", detect_s=1.2, short=(TURNING,)),
     _servo(
         "wrong_way", "the motor runs the wrong way", "wrong_way", servo("wrong_way"),
-        needs="rotation", detect_s=1.2, own_motion=ROTATION,
+        needs="rotation", detect_s=1.2, before_arm=put_back, own_motion=ROTATION,
     ),
     _servo(
-        "runaway", "an outer torque turns the blade", "moving_uncommanded", servo("push", torque_nm=120.0),
-        detect_s=2.5, own_motion=ROTATION,
+        "runaway", "an outer torque turns the blade", "moving_uncommanded", servo("push", torque_nm=55.0),
+        detect_s=2.5, before_arm=put_back, own_motion=ROTATION,
     ),
     _servo("weak_supply", "19.5 V at the servo", "voltage_near_limit", servo("voltage", volts=19.5), detect_s=1.0),
     _servo("hot", "75 °C", "temperature_near_limit", servo("temperature", celsius=75.0), detect_s=1.6),
