@@ -20,8 +20,8 @@ from graderd.hal.stop_input import StopInput
 DEVICE = "stop_input"
 RETRY_S = 0.5
 FIRST_WORD_S = 1.0
-"""The machine starts disarmed, and its devices take as long to open: until the first look nothing needs to stop. A start
-that found the loop closed would else have to be reset like a stop."""
+"""The machine starts disarmed, and its devices take as long to open: until the first look nothing needs to stop. Every
+start would else have to be reset like a stop."""
 
 log = logging.getLogger(__name__)
 

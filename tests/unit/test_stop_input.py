@@ -151,6 +151,10 @@ class Watching:
         self.loop = loop
         self.stops = stops
 
+    async def permitted(self) -> None:
+        """Wait until the loop was read and found closed."""
+        await self.until(lambda: not self.watch._word.condition and self.conditions() == [])
+
     def conditions(self) -> list[str]:
         return [fault.condition for fault in self.watch.faults(time.monotonic())]
 
@@ -193,7 +197,7 @@ async def test_without_a_first_reading_it_soon_means_stop(tmp_path: Path) -> Non
 
 async def test_a_press_is_told_at_once_and_once_and_stands_until_released(tmp_path: Path) -> None:
     async with watching(tmp_path) as w:
-        await w.until(lambda: w.conditions() == [])
+        await w.permitted()
         pressed_s = time.monotonic()
         await w.loop.become("open")
         await w.until(lambda: bool(w.stops))
@@ -204,27 +208,27 @@ async def test_a_press_is_told_at_once_and_once_and_stands_until_released(tmp_pa
         await asyncio.sleep(0.1)
         assert len(w.stops) == 1
         await w.loop.become("closed")
-        await w.until(lambda: w.conditions() == [])
+        await w.permitted()
 
 
 async def test_a_lost_loop_is_told_and_found_again(tmp_path: Path) -> None:
     async with watching(tmp_path) as w:
-        await w.until(lambda: w.conditions() == [])
+        await w.permitted()
         await w.loop.become("gone")
         await w.until(lambda: w.conditions() == ["lost"])
         await w.until(lambda: bool(w.stops))
         await w.loop.become("closed")
-        await w.until(lambda: w.conditions() == [])
+        await w.permitted()
 
 
 async def test_a_short_circuit_is_found_by_the_test_pulse(tmp_path: Path) -> None:
     async with watching(tmp_path, test_every_s=0.05) as w:
-        await w.until(lambda: w.conditions() == [])
+        await w.permitted()
         await w.loop.become("shorted")
         await w.until(lambda: w.conditions() == ["stuck"])
         await w.until(lambda: bool(w.stops))
         await w.loop.become("closed")
-        await w.until(lambda: w.conditions() == [])
+        await w.permitted()
 
 
 async def test_a_port_that_blocks_is_stale_and_nothing_else_waits_for_it(tmp_path: Path) -> None:
@@ -239,18 +243,18 @@ async def test_a_port_that_blocks_is_stale_and_nothing_else_waits_for_it(tmp_pat
         # Never read: lost from the beginning, whatever its age.
         assert [f.condition for f in w.watch.faults(time.monotonic() + FIRST_WORD_S)] == ["lost"]
         release.set()
-        await w.until(lambda: w.conditions() == [])
+        await w.permitted()
         release.clear()
         await w.until(lambda: w.conditions() == ["stale"])
         release.set()
-        await w.until(lambda: w.conditions() == [])
+        await w.permitted()
 
 
 async def test_a_silent_loop_is_stale_then_lost(tmp_path: Path) -> None:
     async with watching(tmp_path, stale_s=0.1) as w:
-        await w.until(lambda: w.conditions() == [])
+        await w.permitted()
         await w.loop.become("silent")
         await w.until(lambda: w.conditions() == ["stale"])
         await w.until(lambda: w.conditions() == ["lost"])
         await w.loop.become("closed")
-        await w.until(lambda: w.conditions() == [])
+        await w.permitted()
