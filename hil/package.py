@@ -41,8 +41,14 @@ def apt_install(root: Path, package: Path) -> None:
     """
     shutil.copy(package, root / "tmp" / package.name)
     shutil.copy("/etc/resolv.conf", root / "etc" / "resolv.conf")
-    script = f"apt-get update -qq && apt-get install -y -qq --no-install-recommends ./{package.name} && graderd --help"
-    command = ["unshare", "--mount", "--fork", "chroot", str(root), "/bin/sh", "-c", f"cd /tmp && {script}"]
+    steps = (
+        "mount -t proc proc /proc",
+        "cd /tmp",
+        "apt-get update -qq",
+        f"apt-get install -y -qq --no-install-recommends ./{package.name}",
+        "graderd --help",
+    )
+    command = ["unshare", "--mount", "--fork", "chroot", str(root), "/bin/sh", "-c", " && ".join(steps)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"hil: apt install fails in the clean root:\n{done.stdout[-3000:]}{done.stderr[-3000:]}")
