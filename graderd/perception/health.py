@@ -17,14 +17,14 @@ from graderd.perception.geometry import F32, U8, Region
 from graderd.perception.registration import BladeFix, Ground
 from graderd.perception.settings import DepthSettings, HealthSettings
 
-SAMPLE_STEP_PX = (12, 8)
+SAMPLE_STEP_PX = (16, 12)
 """Rows and columns: a row costs a walk through memory, a pixel of it hardly anything."""
-TILE_PX = 5
+TILE_PX = 4
 FLAT_GRAY = 1.6
 """Standard deviation (grey levels) within a tile of the smoothed sample below which it shows nothing."""
 STILL_FLAT_PERCENT = 99.0
 CLIPPED_GRAY = 250
-BLUR_ROWS_N = 12
+BLUR_ROWS_N = 9
 BLUR_MIN_CONTRAST = 64.0
 """Square grey levels of four summed pixels."""
 GROUND_AT_M = (0.2, 0.0)

@@ -37,7 +37,7 @@ BODY_BELOW_M = (0.05, 0.13)
 """Heights below the upper edge at which the face is probed."""
 TOP_SEARCH_PX = 36
 """The upper edge is looked for so far above and below where it should be, at 848 pixels across."""
-SUNK_M = 0.025
+SUNK_M = 0.017
 """The blade lower in the ground than this: what was taken for the ground is a layer of soil."""
 
 

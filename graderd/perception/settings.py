@@ -82,7 +82,7 @@ class ColorSettings(Settings):
 class DepthSettings(Settings):
     """The depth rule: soil height above a ground that is fitted anew in every frame."""
 
-    stride_px: int = Field(default=4, ge=1, le=16, description="every n-th row and column is used, at 848 across")
+    stride_px: int = Field(default=5, ge=1, le=16, description="every n-th row and column is used, at 848 across")
     cell_m: Positive = Field(default=0.02, le=0.1, description="size of a cell of the height map in blade coordinates")
     baseline_m: Positive = Field(default=0.095, description="stereo baseline of the D455, for the expected noise")
     disparity_noise_px: Positive = Field(default=0.08, description="rms disparity error of the D455 family")
