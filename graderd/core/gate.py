@@ -152,7 +152,7 @@ def pass_gate(state: GateState, goals: Goals, inputs: GateInputs) -> tuple[GateS
         requested = _goal_of(goals, axis)
         measured = _measured(inputs.pose, axis)
         former = state.setpoints.get(axis)
-        if inputs.mode in ARMED and former is None and measured is not None:
+        if inputs.mode in ARMED and former is None and measured is not None and math.isfinite(measured):
             former = Setpoint(measured, 0.0, measured)
         refusal = _refusal(axis, requested, measured, inputs)
         if former is None or inputs.mode not in ARMED:
@@ -160,7 +160,7 @@ def pass_gate(state: GateState, goals: Goals, inputs: GateInputs) -> tuple[GateS
             continue
         if refusal or requested is None or measured is None:
             # A held axis starts again from where it is measured, at rest: no jump to an old setpoint.
-            at = former.position if measured is None else measured
+            at = former.position if measured is None or not math.isfinite(measured) else measured
             setpoints[axis] = replace(former, position=at, speed=0.0)
             passed[axis] = AxisPass(requested, None, refusal)
             continue

@@ -228,18 +228,15 @@ def _obey(state: State, command: cmd.Command, inputs: Inputs, settings: MachineS
             if state.mode not in ARMED:
                 return no(f"manual operation needs an armed machine; it is {state.mode}", _way_to_armed(state.mode))
             return yes(_manual("manual operation"), "manual")
-        case cmd.Jog() | cmd.Preset():
-            if state.mode is not Mode.MANUAL:
-                return no(
-                    f"moving by hand needs manual mode; the machine is {state.mode}",
-                    _way_to_manual(state.mode),
-                )
-            stages = inputs.resolve(command, inputs.pose)
-            if isinstance(stages, str):
-                return no(stages, "ask for a position inside the limits")
-            lease = Lease(command.client, inputs.now_s + settings.lease_s)
-            moving = replace(state, goals=stages[0], later=stages[1:], lease=lease, reason=f"{command.command} by hand")
-            return yes(moving, "moving while the lease is renewed")
+    # What is left is a jog or a preset.
+    if state.mode is not Mode.MANUAL:
+        return no(f"moving by hand needs manual mode; the machine is {state.mode}", _way_to_manual(state.mode))
+    stages = inputs.resolve(command, inputs.pose)
+    if isinstance(stages, str):
+        return no(stages, "ask for a position inside the limits")
+    lease = Lease(command.client, inputs.now_s + settings.lease_s)
+    moving = replace(state, goals=stages[0], later=stages[1:], lease=lease, reason=f"{command.command} by hand")
+    return yes(moving, "moving while the lease is renewed")
 
 
 def _lease_command(

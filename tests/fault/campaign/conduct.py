@@ -62,6 +62,8 @@ def must_stand(fault: str, before: str) -> tuple[str, ...]:
     row = row_of(fault)
     if row.reaction >= Reaction.DISARM or (row.reaction is Reaction.RETREAT and before == "auto"):
         return EVERYTHING
+    if row.automatic_only and before != "auto":
+        return ()
     return axes_of(held_by(fault))
 
 
