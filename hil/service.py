@@ -203,6 +203,24 @@ class Grader:
         self.api.command(mode)
         return self.wait(mode, lambda s: s["mode"] == mode, 5.0)
 
+    def jog(self, axis: str, value: float, done: Callable[[Status], Any], timeout_s: float = 30.0) -> None:
+        """Jog to ``value``, renewing the lease until ``done``.
+
+        Raises:
+            WaitError: it did not get there.
+        """
+        until_s = time.monotonic() + timeout_s
+        self.api.command("jog", axis=axis, value=value)
+        while not done(self.api.status()):
+            if time.monotonic() > until_s:
+                raise WaitError(f"jog {axis} {value}: not within {timeout_s:g} s; {brief(self.api.status())}")
+            time.sleep(0.05)
+            try:
+                self.api.command("renew")
+            except Refused:
+                self.api.command("jog", axis=axis, value=value)
+        self.api.command("release")
+
     def disarm(self) -> None:
         """Back to disarmed from any mode."""
         mode = self.api.status()["mode"]
@@ -235,7 +253,8 @@ def brief(status: Status | None) -> str:
     soil = status["soil"]
     return (
         f"mode {status['mode']} ({status['reason']}), faults {sorted(faults(status))}, axes {axes}, "
-        f"soil {soil['zone']} {soil['age_s']} s, unmet {mandatory_unmet(status)}, tick {status['tick']}"
+        f"soil {soil['zone']} {soil['age_s']} s ({soil['reason']}), unmet {mandatory_unmet(status)}, "
+        f"tick {status['tick']}"
     )
 
 
@@ -302,11 +321,20 @@ class Rig:
         }
 
 
-def turn(grader: Grader, rig: Rig, to_deg: float = 45.0) -> None:
-    """In automatic, blade at rest on one side, then soil that sends it to the other; returns while it turns."""
-    zone, back_to = ("even", -30.0) if to_deg > 0 else ("right", 45.0)
-    grader.arm("auto")
-    rig.ask("scene", zone="right" if to_deg > 0 else "even", seed=5)
-    grader.wait("at the other end", lambda s: abs(s["axes"]["rotation"]["measured"] - back_to) < 1.0, 40.0)
-    rig.ask("scene", zone=zone, seed=6)
-    grader.wait("turning", lambda s: abs(s["axes"]["rotation"]["velocity_per_s"] or 0) > 5.0, 40.0)
+def new_pass(grader: Grader, rig: Rig, zone: str, seed: int) -> None:
+    """As an operator begins a pass: blade square in manual, fresh soil in front of it, then automatic."""
+    if grader.api.status()["mode"] == "disarmed":
+        grader.arm("manual")
+    else:
+        grader.api.command("manual")
+    rig.ask("scene", zone="none")
+    rig.ask("reset_vehicle")
+    grader.jog("rotate", 0.0, lambda s: abs(s["axes"]["rotation"]["measured"]) <= 0.5)
+    rig.ask("scene", zone=zone, seed=seed)
+    grader.api.command("auto")
+
+
+def turn(grader: Grader, rig: Rig) -> None:
+    """Evenly spread soil, which sends the blade to +45 deg; returns while it turns."""
+    new_pass(grader, rig, "even", 6)
+    grader.wait("turning", lambda s: abs(s["axes"]["rotation"]["velocity_per_s"] or 0) > 3.0, 40.0)

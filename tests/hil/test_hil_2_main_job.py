@@ -7,7 +7,7 @@ import json
 import pytest
 
 from hil.bus import RawBus
-from hil.service import Grader, Rig, faults, turn
+from hil.service import Grader, Rig, faults, new_pass, turn
 
 AFTER_S = 30.0
 
@@ -16,9 +16,9 @@ pytestmark = pytest.mark.timeout(240)
 
 def test_soil_turns_the_blade(ready: Grader, rig: Rig) -> None:
     ready.cli("arm")
-    ready.cli("auto")
+    ready.cli("manual")
     for zone, angle_deg in (("left", 30.0), ("center", 15.0), ("right", -30.0), ("even", 45.0)):
-        rig.ask("scene", zone=zone, seed=3)
+        new_pass(ready, rig, zone, 3)
         ready.wait(
             f"soil {zone}: blade at {angle_deg:+g} deg",
             lambda s, goal=angle_deg: (  # type: ignore[misc]  # a lambda's default has no annotation
