@@ -101,7 +101,7 @@ ROWS = (
         "rotation.turns_lost",
         "the blade servo lost count of its turns: the blade's angle may be wrong by whole turns of the servo",
         "a restart of the servo while it stood outside one turn",
-        "compare the blade with the angle shown (wrong: square it by hand and reboot it), 'graderd rotation confirm-turns'; arm",
+        "compare the blade with the angle shown; if wrong, square it and reboot; 'graderd rotation confirm-turns', arm",
         Reaction.DISARM,
         clear=Clear.ON_REARM,
     ),
