@@ -47,6 +47,8 @@ def load(path: Path | None = None) -> Config:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(path, [f"{path}: not valid TOML: {error}. Correct that line"]) from None
+    except RecursionError:
+        raise ConfigError(path, [f"{path}: nested far too deeply to be a configuration. Restore the file"]) from None
     return parse(data, path, text)
 
 

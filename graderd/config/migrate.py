@@ -80,6 +80,8 @@ def migrate_text(text: str, steps: Mapping[int, Step] = STEPS, current: int = CU
         document = tomlkit.parse(text)
     except TOMLKitError as error:
         raise ConfigError(None, [f"not valid TOML: {error}. Correct that line"]) from None
+    except RecursionError:
+        raise ConfigError(None, ["nested far too deeply to be a configuration. Restore the file"]) from None
     version = document.get("version", current)
     if not isinstance(version, int) or version > current or any(v not in steps for v in range(int(version), current)):
         raise ConfigError(

@@ -184,7 +184,7 @@ def _read_camera(path: Path) -> tuple[CameraCalibration, BladeGeometry, bool]:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DeviceMissingError(str(path), f"cannot be read ({error.strerror or error})") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         line = getattr(error, "lineno", 1)
         raise ProtocolError(f"{path}:{line}", f"not JSON ({error})") from error
     if not isinstance(data, dict) or "color" not in data:

@@ -33,18 +33,25 @@ def chosen(short: bool, faults: list[str], phases: list[str]) -> list[tuple[Case
     ]
 
 
-async def run(pairs: list[tuple[Case, Phase]], broken: str, quiet: bool) -> list[Outcome]:
-    """Run the injections one after the other on one machine."""
+async def run(pairs: list[tuple[Case, Phase]], broken: str, quiet: bool, output: Path | None) -> list[Outcome]:
+    """Run the injections one after the other on one machine; ``output`` is written anew after each."""
     outcomes = []
     with tempfile.TemporaryDirectory(prefix="graderd-faults-") as directory:
         async with Stack(Path(directory), broken) as stack:
             for case, phase in pairs:
                 outcome = await run_case(stack, case, phase)
                 outcomes.append(outcome)
+                if output is not None:
+                    _save(output, outcomes)
                 if not quiet:
                     sys.stdout.write(_line(outcome) + "\n")
                     sys.stdout.flush()
     return outcomes
+
+
+def _save(output: Path, outcomes: list[Outcome]) -> None:
+    results = {"results": [outcome.as_json() for outcome in outcomes]}
+    output.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _line(outcome: Outcome) -> str:
@@ -86,10 +93,8 @@ def main() -> int:
         return 0
     pairs = chosen(options.short, options.fault, options.phase)
     began_s = time.monotonic()
-    outcomes = asyncio.run(run(pairs, options.broken, options.json))
+    outcomes = asyncio.run(run(pairs, options.broken, options.json, options.output))
     results = {"results": [outcome.as_json() for outcome in outcomes]}
-    if options.output is not None:
-        options.output.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     if options.page:
         write(results["results"], CASES, _about(time.monotonic() - began_s), Path("docs/integrators"))
     good_n = sum(outcome.passed for outcome in outcomes)
