@@ -197,8 +197,16 @@ class Grader:
         return self.wait("ready to arm", ready, timeout_s)
 
     def arm(self, mode: str = "manual") -> Status:
-        """Arm and wait until it is done, then go to ``mode``."""
-        self.api.command("arm")
+        """Arm and wait until it is done, then go to ``mode``. Asked again where one reading was not fresh enough."""
+
+        def accepted() -> bool:
+            try:
+                self.api.command("arm")
+            except Refused:
+                return False
+            return True
+
+        wait_for("arming accepted", accepted, 15.0, 0.5)
         self.wait("armed", lambda s: s["mode"] in ("manual", "auto"), 15.0)
         self.api.command(mode)
         return self.wait(mode, lambda s: s["mode"] == mode, 5.0)
