@@ -75,6 +75,16 @@ async def put_back(stack: Stack) -> None:
     await reboot(stack)
 
 
+def on_bare_ground(inject: Action) -> Action:
+    """Without soil: a blade that spins through a heap costs the rig more time than its wires have."""
+
+    async def both(stack: Stack) -> None:
+        await stack.ask_rig("scene", zone="none")
+        await inject(stack)
+
+    return both
+
+
 def _camera(name: str, text: str, fault: str, inject: Action, **more: Any) -> Case:
     return Case(f"camera_{name}", text, (f"camera.{fault}",), inject, heal, **more)
 
@@ -130,11 +140,11 @@ SERVO = (
     _servo("turns_lost", "the turn count jumps", "turns_lost", servo("turns_lost")),
     _servo("jam", "the shaft is blocked", "not_moving", servo("jam"), needs="rotation", detect_s=1.2, short=(TURNING,)),
     _servo(
-        "wrong_way", "the motor runs the wrong way", "wrong_way", servo("wrong_way"),
+        "wrong_way", "the motor runs the wrong way", "wrong_way", on_bare_ground(servo("wrong_way")),
         needs="rotation", detect_s=1.2, before_arm=put_back, own_motion=ROTATION,
     ),
     _servo(
-        "runaway", "an outer torque turns the blade", "moving_uncommanded", servo("push", torque_nm=55.0),
+        "runaway", "an outer torque turns the blade", "moving_uncommanded", on_bare_ground(servo("push", torque_nm=55.0)),
         detect_s=2.5, before_arm=put_back, own_motion=ROTATION,
     ),
     _servo("weak_supply", "19.5 V at the servo", "voltage_near_limit", servo("voltage", volts=19.5), detect_s=1.0),
