@@ -345,4 +345,4 @@ def new_pass(grader: Grader, rig: Rig, zone: str, seed: int) -> None:
 def turn(grader: Grader, rig: Rig) -> None:
     """Evenly spread soil, which sends the blade to +45 deg; returns while it turns."""
     new_pass(grader, rig, "even", 6)
-    grader.wait("turning", lambda s: abs(s["axes"]["rotation"]["velocity_per_s"] or 0) > 3.0, 40.0)
+    grader.wait("turning", lambda s: abs(s["axes"]["rotation"]["velocity_per_s"] or 0) > 2.0, 40.0)

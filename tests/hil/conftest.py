@@ -30,7 +30,7 @@ DROP_IN = Path("/etc/systemd/system/graderd.service.d")
 # 0.2 s longer patience where the whole guest may stand still for that long.
 FOR_THE_GUEST: dict[str, object] = {
     "rotation.poll_hz": 25.0,
-    "rotation.velocity_deg_per_s": 10.0,  # so that a test can look while it turns
+    "rotation.velocity_deg_per_s": 6.0,  # so that a test can look while it turns
     "rotation.watchdog_s": 0.4,
     "rotation.goal_timeout_s": 0.4,
     "rotation.reply_timeout_s": 0.5,
