@@ -231,7 +231,7 @@ class Grader:
 
     def disarm(self) -> None:
         """Back to disarmed from any mode."""
-        mode = self.api.status()["mode"]
+        mode = self.wait("an answer", lambda s: s["mode"], 40.0)["mode"]
         if mode == "stopped":
             self.api.command("reset")
         elif mode != "disarmed":
