@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import subprocess
@@ -130,3 +131,17 @@ def test_rig_bad_arguments(tmp_path: Path, arguments: list[str], message: str) -
     )
     assert result.returncode == 2
     assert message in result.stderr
+
+
+async def test_the_rig_quits_when_the_program_that_started_it_is_gone(tmp_path: Path) -> None:
+    rig = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "drivers.rig", "--dir", str(tmp_path), "--linger-s", "0.2"),
+        stdin=asyncio.subprocess.PIPE,
+    )
+    assert rig.stdin is not None
+    async with asyncio.timeout(60):
+        while not (tmp_path / "rig.json").exists():
+            await asyncio.sleep(0.05)
+        rig.stdin.close()
+        assert await rig.wait() == 0
+    assert not (tmp_path / "control.sock").exists()

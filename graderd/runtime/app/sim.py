@@ -17,6 +17,8 @@ from graderd.hal.errors import DeviceMissingError
 
 READY_TIMEOUT_S = 30.0
 RESTART_PAUSE_S = 1.0
+LINGER_S = 10.0
+"""The rig outlives a killed daemon by so much, so that what the servo's watchdog does then can be seen."""
 RIG_STREAMS = {
     "color_width_px": 640,
     "color_height_px": 400,
@@ -46,7 +48,10 @@ class RigProcess:
         ready = self.directory / "rig.json"
         ready.unlink(missing_ok=True)
         self._process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "drivers.rig", "--dir", str(self.directory), *self._arguments, start_new_session=True
+            *(sys.executable, "-m", "drivers.rig", "--dir", str(self.directory), "--linger-s", f"{LINGER_S:g}"),
+            *self._arguments,
+            stdin=asyncio.subprocess.PIPE,
+            start_new_session=True,
         )
         deadline = asyncio.get_running_loop().time() + READY_TIMEOUT_S
         while not ready.exists():
