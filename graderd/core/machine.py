@@ -177,7 +177,7 @@ def _react(state: State, inputs: Inputs) -> State:
     if state.mode in ARMED and not inputs.devices_active:
         return _disarmed("a device left its active state")
     if fault is not None and fault.row.reaction is Reaction.RETREAT and state.mode is Mode.AUTO:
-        return replace(_manual(f"{fault.name}: {fault.row.reads}"), holding=state.holding)
+        return _manual(f"{fault.name}: {fault.row.reads}")
     return state
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from graderd.core import commands as cmd
-from graderd.core.fault_catalogue import _by_key
+from graderd.core.fault_catalogue import _by_key, find_rows
 from graderd.core.faults import (
     ALL_AXES,
     ActiveFault,
@@ -33,7 +33,7 @@ from graderd.core.faults import (
     worst,
 )
 from graderd.core.gate import AXES, GateInputs, GateSettings, GateState, pass_gate
-from graderd.core.machine import Goals, MachineSettings, Mode, Pose, State, Step, step
+from graderd.core.machine import Goals, MachineSettings, Mode, Pose, State, Step, Unmet, step
 from graderd.core.rule import RuleSettings
 from graderd.core.zones import SoilObservation, Zone
 from graderd.hal.fault import DeviceFault
@@ -81,6 +81,8 @@ def machine_answers() -> Iterator[tuple[str, Any]]:
                 yield key, told(do(state, faults=(one,), devices_active=True))
                 yield f"{key}, automatic only", told(do(state, faults=(blind,), devices_active=True))
     gone = replace(fault(Reaction.STOP), present=False)
+    stages = (Goals(tilt_mm=5.0), Goals(tilt_mm=6.0), Goals(tilt_mm=7.0))
+    two = (Unmet("tilt", "silent", "look"), Unmet("stop", "pressed", "release"), Unmet("lift_left", "far", "look"))
     many: dict[str, tuple[State, tuple[cmd.Command, ...], dict[str, Any]]] = {
         "stop and reset": (STATES["manual"], (cmd.Reset(), cmd.Stop(client="x", reason="why")), {}),
         "two commands": (STATES["manual"], (cmd.Auto(), cmd.Manual()), {}),
@@ -97,12 +99,33 @@ def machine_answers() -> Iterator[tuple[str, Any]]:
         "arm while released": (STATES["disarmed"], (cmd.Arm(),), {"devices_active": True}),
         "arm with a latched fault": (STATES["disarmed"], (cmd.Arm(),), {"devices_active": False,
                                      "faults": (replace(fault(Reaction.DISARM), present=False),)}),
+        "stop, reset, arm": (STATES["manual"], (cmd.Stop(), cmd.Reset(), cmd.Arm()), {}),
+        "a preset from where it is": (STATES["manual"], (cmd.Preset(name="p"),), {
+            "resolve": lambda _, pose: (Goals(pose.rotation_deg, pose.lift_left_mm),)}),
+        "renewed later": (jogging, (cmd.Renew(client="a"),), {"now_s": NOW_S + 0.25}),
+        "armed already": (STATES["manual"], (cmd.Arm(),), {}),
+        "several unmet": (STATES["disarmed"], (cmd.Arm(),), {"devices_active": False, "unmet": two}),
+        "stage by stage": (replace(jogging, later=stages), (), {"settled": True}),
         "first picture": (STATES["auto"], (), {"observation": seen}),
         "next stage": (replace(jogging, later=(Goals(tilt_mm=5.0),)), (), {"settled": True}),
         "stage not reached": (replace(jogging, later=(Goals(tilt_mm=5.0),)), (), {"settled": False}),
     }  # fmt: skip
     for name, (state, commands, changes) in many.items():
         yield name, told(do(state, *commands, **({"devices_active": True} | changes)))
+
+
+def automatic_answers() -> Iterator[tuple[str, Any]]:
+    """A decision, a change of it, and a swing in between."""
+    state = STATES["auto"]
+    for tick in range(60):
+        now_s = NOW_S + 0.1 * tick
+        zone = Zone.LEFT if tick < 30 else Zone.RIGHT
+        shares = {"share_left": 0.9} if tick < 30 else {"share_right": 0.9}
+        seen = SoilObservation(now_s, zone, 0.9, "", **shares)
+        settled = tick not in range(6, 9)
+        result = do(state, now_s=now_s, observation=seen, settled=settled, devices_active=True)
+        state = result.state
+        yield f"automatic, tick {tick}", [told(result), len(state.decision.votes)]
 
 
 def gate_answers() -> Iterator[tuple[str, Any]]:
@@ -184,13 +207,24 @@ def fault_answers() -> Iterator[tuple[str, Any]]:
     for name in names:
         yield f"row of {name}", plain(asdict(row_for(device_fault(name, ""), catalogue)))
     equal = [ActiveFault(n, row(n, Reaction.HOLD, Clear.WHEN_GONE), "", at, True) for n, at in (("b", 2.0), ("a", 2.0))]
+    for name in (
+        "rotation.no_reply",
+        "tilt.overload",
+        "actuator.overload",
+        "overload",
+        "tilt",
+        "can",
+        "tilt.nothing",
+        "",
+    ):
+        yield f"find {name}", [found.key for found in find_rows(name)]
     yield "worst of equals", plain(asdict(worst(equal) or equal[1]))
     yield "worst of nothing", worst([])
 
 
 def answers() -> dict[str, Any]:
     found: dict[str, Any] = {}
-    for part in (machine_answers, gate_answers, fault_answers):
+    for part in (machine_answers, automatic_answers, gate_answers, fault_answers):
         for key, value in part():
             assert key not in found, key
             found[key] = value
