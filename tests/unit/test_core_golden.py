@@ -119,9 +119,9 @@ def automatic_answers() -> Iterator[tuple[str, Any]]:
     state = STATES["auto"]
     for tick in range(60):
         now_s = NOW_S + 0.1 * tick
-        zone = Zone.LEFT if tick < 30 else Zone.RIGHT
-        shares = {"share_left": 0.9} if tick < 30 else {"share_right": 0.9}
-        seen = SoilObservation(now_s, zone, 0.9, "", **shares)
+        left = tick < 30
+        shares = (0.9, 0.0, 0.0) if left else (0.0, 0.0, 0.9)
+        seen = SoilObservation(now_s, Zone.LEFT if left else Zone.RIGHT, 0.9, "", *shares)
         settled = tick not in range(6, 9)
         result = do(state, now_s=now_s, observation=seen, settled=settled, devices_active=True)
         state = result.state
