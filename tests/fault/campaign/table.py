@@ -144,7 +144,8 @@ SERVO = (
         needs="rotation", detect_s=1.2, before_arm=put_back, own_motion=ROTATION,
     ),
     _servo(
-        "runaway", "an outer torque turns the blade", "moving_uncommanded", on_bare_ground(servo("push", torque_nm=55.0)),
+        "runaway", "an outer torque turns the blade", "moving_uncommanded",
+        on_bare_ground(servo("push", torque_nm=55.0)),
         detect_s=2.5, before_arm=put_back, own_motion=ROTATION,
     ),
     _servo("weak_supply", "19.5 V at the servo", "voltage_near_limit", servo("voltage", volts=19.5), detect_s=1.0),
