@@ -224,7 +224,7 @@ def fault_answers() -> Iterator[tuple[str, Any]]:
 
 def answers() -> dict[str, Any]:
     found: dict[str, Any] = {}
-    for part in (machine_answers, automatic_answers, gate_answers, fault_answers):
+    for part in (machine_answers, automatic_answers, gate_answers, bound_answers, fault_answers):
         for key, value in part():
             assert key not in found, key
             found[key] = value
