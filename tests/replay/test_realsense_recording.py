@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.realsense import RecordingCamera
+from drivers.realsense import RecordingCamera, sdk
 from graderd.core.blade import BladeGeometry
 from graderd.core.zones import Zone
 from graderd.hal.camera import EndOfFrames, Frame
@@ -141,8 +141,12 @@ def test_a_stall_is_not_the_end(recording: Path, monkeypatch: pytest.MonkeyPatch
         def stop(self) -> None:
             pipeline.stop()
 
+    class Playing:
+        def current_status(self) -> sdk.Rs:
+            return sdk.load().playback_status.playing
+
     pipeline = camera._pipeline
-    camera._pipeline = Stalled()
+    camera._pipeline, camera._playback = Stalled(), Playing()
     with pytest.raises(DeviceTimeoutError):
         camera.read(0.02)
     camera.close()
