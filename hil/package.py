@@ -91,4 +91,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    uml.end_in_order()
     sys.exit(main())

@@ -122,4 +122,5 @@ def in_guests(package: Path, part: str, soak_s: float) -> list[int]:
 
 
 if __name__ == "__main__":
+    uml.end_in_order()
     sys.exit(main())

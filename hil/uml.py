@@ -115,6 +115,11 @@ class Guest:
         ]
 
 
+def end_in_order() -> None:
+    """Let SIGTERM unwind the main program, so that a terminated launcher still takes its guest away."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+
+
 def missing() -> list[str]:
     """What the launcher needs and this machine has not, as paths."""
     found = [KERNEL, BUSYBOX]
@@ -205,6 +210,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    # A terminated launcher must still take its guest away.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    end_in_order()
     sys.exit(main())
