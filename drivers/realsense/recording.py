@@ -13,7 +13,7 @@ from graderd.hal.settings import CameraSettings
 POLL_MS = 250
 APART_S = 0.02
 """A set whose colour and depth lie further apart in device time is torn."""
-TORN_SHOWN_N = 5
+TORN_SHOWN_N = 30
 """So many torn sets in a row are no accident of playing: they are handed out, and the health check names them."""
 
 
