@@ -77,16 +77,24 @@ class CameraSection(CameraSettings):
     calibration: CameraCalibration = Field(default_factory=CameraCalibration)
 
 
-def _lift_left() -> ActuatorSettings:
-    return ActuatorSettings(address_n=19)
+class LiftLeftSection(ActuatorSettings):
+    """The left lift: an Electrak HD with no address pin wired."""
 
 
-def _lift_right() -> ActuatorSettings:
-    return ActuatorSettings(address_n=20)
+class LiftRightSection(ActuatorSettings):
+    """The right lift: the same unit with address select 1."""
+
+    address_n: int = Field(20, ge=0, le=253)
 
 
-def _tilt() -> ActuatorSettings:
-    return ActuatorSettings(address_n=27, profile="electrak_md_a050", min_mm=3.0, max_mm=97.0, current_limit_a=3.5)
+class TiltSection(ActuatorSettings):
+    """The tilt: an Electrak MD of 500 N and 100 mm."""
+
+    address_n: int = Field(27, ge=0, le=253)
+    profile: str = "electrak_md_a050"
+    min_mm: NotNegative = 3.0
+    max_mm: Positive = 97.0
+    current_limit_a: Positive = Field(3.5, le=25.0)
 
 
 def _presets() -> dict[str, Preset]:
@@ -109,9 +117,9 @@ class Config(Settings):
     blade: BladeGeometry = Field(default_factory=BladeGeometry)
     rotation: RotatorSettings = Field(default_factory=RotatorSettings)
     can: CanSettings = Field(default_factory=CanSettings)
-    lift_left: ActuatorSettings = Field(default_factory=_lift_left)
-    lift_right: ActuatorSettings = Field(default_factory=_lift_right)
-    tilt: ActuatorSettings = Field(default_factory=_tilt)
+    lift_left: LiftLeftSection = Field(default_factory=LiftLeftSection)
+    lift_right: LiftRightSection = Field(default_factory=LiftRightSection)
+    tilt: TiltSection = Field(default_factory=TiltSection)
     attitude: AttitudeGeometry = Field(default_factory=AttitudeGeometry)
     lift_pair: LiftPairSettings = Field(default_factory=LiftPairSettings)
     rule: RuleSettings = Field(default_factory=RuleSettings)

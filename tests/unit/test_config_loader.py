@@ -76,3 +76,10 @@ sections = st.dictionaries(st.sampled_from([*Config.model_fields, "x"]), values,
 def test_nonsense_never_raises_anything_else(data: dict[str, object]) -> None:
     with suppress(ConfigError):
         parse(data)
+
+
+def test_a_section_given_in_part_keeps_its_own_defaults_for_the_rest() -> None:
+    config = parse({"lift_right": {"speed_percent": 60}, "tilt": {"speed_percent": 60}})
+    assert (config.lift_left.address_n, config.lift_right.address_n, config.tilt.address_n) == (19, 20, 27)
+    assert config.tilt.profile == Config().tilt.profile == "electrak_md_a050"
+    assert config.tilt.max_mm == 97.0
