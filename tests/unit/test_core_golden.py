@@ -165,6 +165,14 @@ def gate_answers() -> Iterator[tuple[str, Any]]:
         yield f"{name}, {mode}, lease {lease_ok}", plain(rows)
 
 
+def bound_answers() -> Iterator[tuple[str, Any]]:
+    """A window that ends exactly where the limit is: the limit is named."""
+    settings = GateSettings(rotation_window_deg=60.0)
+    for goal_deg in (-61.0, -60.0, 60.0, 61.0):
+        inputs = GateInputs(settings, Mode.MANUAL, Pose(0.0, 100.0, 100.0, 50.0), 0.02, True)
+        yield f"window equals limit, {goal_deg}", pass_gate(GateState(), Goals(goal_deg), inputs)[1]["rotation"].reason
+
+
 def row(
     key: str, reaction: Reaction, clear: Clear, debounce_s: float = 0.0, axes: frozenset[str] = ALL_AXES
 ) -> FaultRow:
