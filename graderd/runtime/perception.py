@@ -24,6 +24,7 @@ from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CameraSettings
+from graderd.perception.pipeline import usable
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
 from graderd.runtime.worker_protocol import (
     Angle,
@@ -95,13 +96,14 @@ class PerceptionWorker:
         return self._newest
 
     def take_observation(self) -> SoilObservation | None:
-        """The newest observation if it was not taken before and is not stale; else None."""
+        """The newest observation if it was not taken before; of an old frame it says unknown, a stale one is None."""
         if self._taken or self._newest is None:
             return None
         self._taken = True
-        if self._clock.now_s() - self._newest.capture_s > self._camera.stale_s:
+        now_s = self._clock.now_s()
+        if now_s - self._newest.capture_s > self._camera.stale_s:
             return None
-        return self._newest
+        return usable(self._newest, now_s, self._start.perception.decision)
 
     @property
     def frames_per_s(self) -> float:

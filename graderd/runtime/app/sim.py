@@ -17,6 +17,8 @@ from graderd.hal.errors import DeviceMissingError
 
 READY_TIMEOUT_S = 30.0
 RESTART_PAUSE_S = 1.0
+RIG_FRAME_AGE_S = 0.4
+"""A rendered picture is as old as its rendering took, which a busy machine stretches; a real camera has 0.1 s."""
 LINGER_S = 10.0
 """The rig outlives a killed daemon by so much, so that what the servo's watchdog does then can be seen."""
 RIG_STREAMS = {
@@ -111,8 +113,10 @@ def attach(config: Config, directory: Path) -> Config:
         ) from None
     plays_files = config.camera.source not in ("realsense", "rig")
     camera = {} if plays_files else {"source": "rig", "path": rig["camera"], **RIG_STREAMS}
+    decision = config.perception.decision.model_copy(update={"max_frame_age_s": RIG_FRAME_AGE_S})
     changes = {
         "simulated": True,
+        "perception": config.perception.model_copy(update={"decision": decision}),
         "camera": config.camera.model_copy(update=camera),
         "rotation": config.rotation.model_copy(update={"port": rig["servo"], "usb_serial_number": ""}),
         "can": config.can.model_copy(update=rig["can"]),

@@ -10,6 +10,7 @@ import os
 import queue
 import sys
 import threading
+import time
 from bisect import bisect_left
 from collections import deque
 from pathlib import Path
@@ -23,6 +24,7 @@ from graderd.hal.errors import DeviceError, DeviceTimeoutError
 from graderd.hal.settings import CameraSettings
 from graderd.perception import Classifier, make_classifier
 from graderd.perception.frame_set import Entry, FrameSetWriter
+from graderd.perception.pipeline import judge_frame
 from graderd.perception.settings import CameraCalibration, StreamCalibration
 from graderd.runtime.app.frame_sources import open_camera
 from graderd.runtime.worker_protocol import (
@@ -116,7 +118,9 @@ class Worker:
                 not_kept=settings_not_kept(settings, read_back),
             )
         )
-        classifier = make_classifier(self._start.perception, self._start.calibration, self._start.blade)
+        classifier = make_classifier(
+            self._start.perception, self._start.calibration, self._start.blade, camera=settings
+        )
         try:
             return self._judge(camera, classifier)
         finally:
@@ -136,7 +140,9 @@ class Worker:
                 self._send(Trouble(condition="missing", message=str(error), final=True))
                 return 3
             angle_deg, age_s = self._angles.at(frame.capture_s)
-            observation = classifier.classify(frame, angle_deg, age_s)
+            observation = judge_frame(
+                classifier, frame, angle_deg, age_s, time.monotonic(), self._start.perception.decision
+            )
             self._send(Observed.of(observation))
             if not self._to_save.empty():
                 self._save(self._to_save.get(), frame)
