@@ -299,7 +299,7 @@ class CanLink:
             self._on_claim(frame, now_s)
         message = self._node.on_frame(frame, now_s)
         if message is not None:
-            self._stop.on_message(message)
+            self._stop.on_message(message, now_s)
             for listener in self._taps.messages:
                 listener(message, now_s)
 

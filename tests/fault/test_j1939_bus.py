@@ -227,6 +227,17 @@ def test_stop_messages_call_on_stop(pgn: int, data: list[bytes], stops_n: int) -
     run_simulated(main)
 
 
+def test_a_switch_that_goes_on_saying_stop_stops_again() -> None:
+    async def main(loop: SimulatedLoop) -> None:
+        async with Machine(loop, names=("lift_left",)) as machine:
+            for _ in range(5):
+                machine.bus.send(Frame(make_id(3, Pgn.STOP_ALL_IMPLEMENTS, 38), STOP))
+                await asyncio.sleep(0.11)
+            assert len(machine.stops) == 5
+
+    run_simulated(main)
+
+
 def test_stop_messages_may_be_switched_off() -> None:
     async def main(loop: SimulatedLoop) -> None:
         can_settings = CanSettings(interface="virtual", stop_on_iso11783_all_stop=False)
