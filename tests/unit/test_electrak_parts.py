@@ -76,7 +76,8 @@ def test_no_message_aims_further_than_the_look_ahead(
     if not control.motion_enable:
         assert abs(target_mm - position_mm) <= 1.2
         return
-    here_mm = position_mm + velocity_mm_per_s * min(age_s, HD.afm_period_s)
+    # Its end stops keep the tube inside the stroke, whatever the last velocity was.
+    here_mm = min(max(position_mm + velocity_mm_per_s * min(age_s, HD.afm_period_s), 0.0), HD.stroke_mm)
     reach_mm = HD.speed_mm_per_s(control.speed_percent) * 0.3 + HD.dead_zone_mm
     assert abs(control.target_mm - here_mm) <= reach_mm + 0.06 or (
         (control.target_mm - here_mm) * (target_mm - position_mm) <= 0
