@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
@@ -51,9 +52,9 @@ class FakePort:
         self.closed_n += 1
 
 
-def serial_input(port: FakePort, **settings: object) -> SerialStopInput:
+def serial_input(port: FakePort, **settings: Any) -> SerialStopInput:
     return SerialStopInput(
-        StopInputSettings(backend="serial", port="/dev/null", **settings),  # type: ignore[arg-type]  # as the model has them
+        StopInputSettings(backend="serial", port="/dev/null", **settings),
         open_port=lambda _: port,
         sleep=lambda _: None,
     )
@@ -165,12 +166,12 @@ class Watching:
 
 
 @asynccontextmanager
-async def watching(tmp_path: Path, source: StopInput | None = None, **settings: float) -> AsyncIterator[Watching]:
+async def watching(tmp_path: Path, source: StopInput | None = None, **settings: Any) -> AsyncIterator[Watching]:
     loop = StopLoop(tmp_path / "stop.sock")
     await loop.start()
     stops: list[tuple[float, str]] = []
     watch = StopInputWatch(
-        StopInputSettings(backend="simulated", **settings),  # type: ignore[arg-type]  # as the model has them
+        StopInputSettings(backend="simulated", **settings),
         source or SimulatedStopInput(str(loop.path)),
         SystemClock(),
         lambda reason: stops.append((time.monotonic(), reason)),
