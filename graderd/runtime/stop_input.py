@@ -49,14 +49,21 @@ class StopInputWatch:
         self._word = _Word("lost", f"{source.where} was not read yet", clock.now_s())
         self._since_s = clock.now_s()
         self._quiet_until_s = clock.now_s() + FIRST_WORD_S
+        self._asked_s = clock.now_s()
+        self._grace_until_s = clock.now_s()
 
     def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """Why operation is not permitted; empty while the loop is closed."""
         word = self._word
+        asked_s, self._asked_s = self._asked_s, now_s
+        if now_s - asked_s > self._settings.stale_s / 2:
+            # This whole process stood still, so the thread did too: that it has not read says nothing about the loop.
+            # It gets two of its periods; the freeze itself is a fault of its own (daemon.loop_blocked).
+            self._grace_until_s = now_s + 2.0 / self._settings.poll_hz
         if now_s < self._quiet_until_s:
             return ()
         age_s = now_s - word.time_s
-        if age_s > self._settings.stale_s and word.condition != "lost":
+        if age_s > self._settings.stale_s and word.condition != "lost" and now_s >= self._grace_until_s:
             return (DeviceFault(DEVICE, "stale", f"{self._source.where}: no reading for {age_s:.2f} s", word.time_s),)
         if word.condition:
             return (DeviceFault(DEVICE, word.condition, word.detail, self._since_s),)

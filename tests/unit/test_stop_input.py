@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from drivers.stop_input import SerialStopInput, SimulatedStopInput, StopLoop, ma
 from graderd.config import Config
 from graderd.core.fault_catalogue import CATALOGUE
 from graderd.core.faults import Clear, Reaction
-from graderd.hal.clock import SystemClock
+from graderd.hal.clock import ManualClock, SystemClock
 from graderd.hal.errors import DeviceLostError, DeviceMissingError
 from graderd.hal.settings import StopInputSettings
 from graderd.hal.stop_input import StopInput
@@ -259,3 +260,16 @@ async def test_a_silent_loop_is_stale_then_lost(tmp_path: Path) -> None:
         await w.until(lambda: w.conditions() == ["lost"])
         await w.loop.become("closed")
         await w.permitted()
+
+
+def test_a_frozen_process_does_not_take_its_own_silence_for_the_loops(tmp_path: Path) -> None:
+    settings = StopInputSettings(backend="simulated", port=str(tmp_path / "stop.sock"))
+    watch = StopInputWatch(settings, SimulatedStopInput(settings.port), ManualClock(0.0), lambda _: None)
+    read_s = FIRST_WORD_S + 1.0
+    watch._word = replace(watch._word, condition="", time_s=read_s)
+    assert watch.faults(read_s) == ()
+    thawed_s = read_s + 1.0
+    assert watch.faults(thawed_s) == ()
+    after_s = thawed_s + 2.0 / settings.poll_hz
+    assert watch.faults(after_s - 1e-6) == ()
+    assert [fault.condition for fault in watch.faults(after_s)] == ["stale"]
