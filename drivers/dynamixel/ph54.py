@@ -223,12 +223,14 @@ class Ph54Rotator:
             self._command.hold()
             loop = asyncio.get_running_loop()
             until_s, still_n = loop.time() + _STOP_S, 0
-            began = self._observer.telemetry.angle_deg
+            began = None  # where the blade was when the servo had taken the hold, which a bad line may delay
             while loop.time() < until_s and still_n < _STILL_READS_N:
                 await self._tolerant(self._send_command(device))
                 await self._tolerant(self._observer.read_telemetry(device, None))
                 speed, angle = self._observer.telemetry.velocity_deg_per_s, self._observer.telemetry.angle_deg
                 still_n = still_n + 1 if speed is not None and abs(speed.value) < 1.0 else 0
+                if began is None and not self._command.hold_wanted:
+                    began = angle
                 if off and began is not None and angle is not None and abs(angle.value - began.value) > _RUNAWAY_DEG:
                     log.warning("%s: does not obey the hold: torque off without waiting for rest", DEVICE)
                     break

@@ -294,7 +294,7 @@ class PerceptionWorker:
 
     async def _kill(self) -> None:
         """End the child, hung or not, and wait for it (a killed process is gone in milliseconds)."""
-        process, self._process = self._process, None
+        process = self._process
         if process is None:
             return
         if process.returncode is None:
@@ -302,4 +302,6 @@ class PerceptionWorker:
                 process.kill()
         if process.stdin is not None:
             process.stdin.close()
+        # Forgotten only when it is reaped: cancelled while waiting here, run() comes here again.
         await process.wait()
+        self._process = None
