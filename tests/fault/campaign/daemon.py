@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -62,6 +63,7 @@ class Hooks:
         self._file = directory / "hook.json"
         self._kept: list[bytearray] = []
         self._time = time.time
+        self._disk_usage = shutil.disk_usage
         self._step_s = 0.0
 
     def on_signal(self, _: int, __: FrameType | None) -> None:
@@ -73,6 +75,10 @@ class Hooks:
             self._step_s += wanted["clock_step_s"]
             step_s = self._step_s
             time.time = lambda: self._time() + step_s
+        if "disk_full" in wanted:
+            usage = self._disk_usage
+            # Less than nothing: below any limit that may be configured, 0 included.
+            shutil.disk_usage = (lambda path: usage(path)._replace(free=-1)) if wanted["disk_full"] else usage
         if "memory_mb" in wanted:
             threading.Thread(target=self._take_memory, args=(int(wanted["memory_mb"]),), daemon=True).start()
 

@@ -48,15 +48,23 @@ def _record(stack: Stack) -> Path:
     return max((stack.directory / "records").glob("graderd-*.jsonl"), key=lambda path: path.name)
 
 
+FULL = Path("/dev/full")
+
+
 async def fill_disk(stack: Stack) -> None:
     """Every write to the recording fails with "no space left on device"."""
+    if not FULL.exists():  # a bare container's /dev: then the system call that asks for free space says none
+        stack.hook(disk_full=1)
+        return
     path = _record(stack)
     path.rename(path.with_suffix(".kept"))
-    path.symlink_to("/dev/full")
+    path.symlink_to(FULL)
 
 
 async def empty_disk(stack: Stack) -> None:
     """There is room again."""
+    if not FULL.exists():
+        stack.hook(disk_full=0)
     for kept in (stack.directory / "records").glob("*.kept"):
         path = kept.with_suffix(".jsonl")
         path.unlink(missing_ok=True)
