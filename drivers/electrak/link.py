@@ -342,7 +342,7 @@ class CanLink:
                     self.counters.reopened_n += 1
                 except DeviceError as error:
                     self._health.on_open_failed(error, self._clock.now_s())
-                except Exception:
+                except Exception:  # a bug in here must not end the search for the bus
                     _log.exception("%s: opening failed in an unexpected way; will try again", self.where)
 
     async def _open_port(self) -> None:

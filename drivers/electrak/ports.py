@@ -295,6 +295,6 @@ class _Bridge:
                         item = BusEvent.QUEUE_OVERRUN
                     self._items.append(item)
                     self._wake()
-        except Exception as error:
+        except Exception as error:  # whatever ended this thread is raised to the reader, never lost with it
             self._error = error
             self._wake()

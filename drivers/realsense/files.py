@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -45,7 +46,7 @@ def pictures_in(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES and p.is_file())
 
 
-class _Paced:
+class _Paced(ABC):
     """What folder and video have in common: frames handed out one after the other, at a rate or as fast as read."""
 
     def __init__(self, settings: CameraSettings, real_time: bool = True) -> None:
@@ -71,11 +72,13 @@ class _Paced:
         self._frames = self._every()
         self._due_s = time.monotonic()
 
+    @abstractmethod
     def _check(self) -> None:
-        raise NotImplementedError
+        """Raise where there is nothing to read."""
 
+    @abstractmethod
     def _every(self) -> Iterator[tuple[str, Load]]:
-        raise NotImplementedError
+        """Every picture's name and how to load it, in their order."""
 
     def read(self, timeout_s: float) -> Frame:  # noqa: ARG002  (the contract's; a file is always there)
         """The next picture.
@@ -105,6 +108,7 @@ class _Paced:
 
     def reset_hardware(self) -> None:
         """No effect."""
+        return
 
     def close(self) -> None:
         """Let go of the source; idempotent."""

@@ -15,7 +15,7 @@ from graderd.core.faults import Clear, FaultState, clear_faults, update_faults
 from graderd.core.gate import AxisPass, GateInputs, GateState, pass_gate
 from graderd.core.lift import LiftCoordinator, height_mm
 from graderd.core.lift_pair import SideReading
-from graderd.core.machine import ARMED, Goals, Inputs, Intents, Mode, Pose, State, step
+from graderd.core.machine import ARMED, Inputs, Intents, Mode, Pose, State, step
 from graderd.core.motion import resolve
 from graderd.core.zones import SoilObservation
 from graderd.hal.clock import Clock
@@ -313,11 +313,6 @@ class ControlLoop:
             for fault in self.faults.active
             for device, _, condition in (fault.name.partition("."),)
         )
-
-    @property
-    def goals(self) -> Goals:
-        """What the machine asks for now."""
-        return self.intents.goals
 
     def lifecycle(self, axis: str) -> Lifecycle:
         """Lifecycle of an axis's device."""
