@@ -9,7 +9,7 @@ from typing import Any
 
 import can
 
-from drivers.dynamixel.virtual import VirtualServoBus
+from drivers.dynamixel.virtual import PlantSettings, VirtualServoBus
 from drivers.electrak.j1939.ids import Frame
 from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
 from drivers.rig.blade import GROUND_LIFT_MM, LEVEL_TILT_MM, BladePose
@@ -18,6 +18,8 @@ from drivers.rig.world import World
 from graderd.hal.clock import SystemClock
 
 _ADDRESSES = {"lift_left": 19, "lift_right": 20, "tilt": 27}
+STOPS_DEG = 75.0
+"""The blade's ends meet the machine's frame there, so that one that is pushed or runs away does not spin for ever."""
 _LONGEST_STEP_S = 0.05
 """A process that was stopped for longer lets the machine miss that time instead of jumping."""
 _UNLOADED_LIFT_N = 150.0
@@ -35,7 +37,7 @@ class Machine:
 
     def __init__(self, servo_link: Path, can_link: Path, can_bus: can.BusABC | None, seed: int) -> None:
         self.world = World()
-        self.servo = TimedServo(servo_id=1, seed=seed)
+        self.servo = TimedServo(servo_id=1, seed=seed, plant=PlantSettings(stops_deg=STOPS_DEG))
         self.servo_bus = VirtualServoBus([self.servo], servo_link)
         self.lift_left = VirtualElectrak("electrak_hd_b017", _ADDRESSES["lift_left"], GROUND_LIFT_MM, seed)
         self.lift_right = VirtualElectrak("electrak_hd_b017", _ADDRESSES["lift_right"], GROUND_LIFT_MM, seed + 1)
@@ -113,8 +115,10 @@ class Machine:
         """Somebody turns the blade by hand.
 
         Raises:
-            ValueError: the servo holds it.
+            ValueError: the servo holds it, or the frame is in the way.
         """
+        if abs(angle_deg) > STOPS_DEG:
+            raise ValueError(f"the blade turns to {STOPS_DEG:g} degrees at most")
         if self.servo.torque_enabled:
             raise ValueError("the servo's torque holds the blade; disarm first")
         self.servo.shaft_deg = angle_deg

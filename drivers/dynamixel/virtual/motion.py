@@ -74,7 +74,10 @@ class Trajectory:
 
 @dataclass
 class PlantSettings:
-    """What hangs on the servo; the defaults are a 1 m steel blade on a 1/4-scale machine."""
+    """What hangs on the servo; the defaults are a 1 m steel blade on a 1/4-scale machine.
+
+    ``stops_deg``: mechanical ends of the output's turn on either side, hit without a bounce; infinite: none.
+    """
 
     inertia_kg_m2: float = 0.8
     friction_nm: float = 3.0
@@ -82,6 +85,7 @@ class PlantSettings:
     bandwidth_hz: float = 12.0
     integral_s: float = 0.15
     backlash_deg: float = 0.1
+    stops_deg: float = math.inf
     torque_nm_per_a: float = 4.806
     no_load_current_a: float = 1.65
     no_load_deg_per_s: float = 198.6
@@ -174,6 +178,9 @@ class Plant:
             slowed = max(0.0, abs(free) - s.friction_nm * per_step)
             self.velocity_deg_per_s = math.copysign(slowed, free)
             self.motor_deg += self.velocity_deg_per_s * dt_s
+            if abs(self.motor_deg) > s.stops_deg:
+                self.motor_deg = math.copysign(s.stops_deg, self.motor_deg)
+                self.velocity_deg_per_s = 0.0
         half = s.backlash_deg / 2
         self.shaft_deg = max(self.motor_deg - half, min(self.motor_deg + half, self.shaft_deg))
         if abs(self.load_torque_nm) > s.friction_nm:  # the load holds the play on its own side

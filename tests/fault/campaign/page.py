@@ -45,9 +45,8 @@ CANNOT = """\
 PHASES = tuple(phase.value for phase in Phase)
 
 
-def write(results: Sequence[dict[str, Any]], cases: Sequence[Case], about: dict[str, Any], directory: Path) -> None:
-    """Write ``fault-campaign.json`` and ``fault-campaign.md`` into ``directory``."""
-    data = {"about": about, "results": list(results)}
+def write(data: dict[str, Any], cases: Sequence[Case], directory: Path) -> None:
+    """Write ``fault-campaign.json`` and ``fault-campaign.md`` into ``directory``; ``data``: about and results."""
     (directory / "fault-campaign.json").write_text(
         json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
     )
@@ -58,7 +57,11 @@ def page(data: dict[str, Any], cases: Sequence[Case]) -> str:
     """The page's text."""
     results = {(r["fault"], r["phase"]): r for r in data["results"]}
     passed_n = sum(r["passed"] for r in data["results"])
-    about = ", ".join(f"{key} {value}" for key, value in data["about"].items())
+    told = data["about"]
+    about = (
+        f"Measured {told['measured']} on {told['cores']} cores at a load of {told['load']} (15 min mean), "
+        f"in {told['took_s'] / 60:.0f} min"
+    )
     parts = [HEAD.format(brake=BRAKE_S, slack=SLACK_S), "## Result\n"]
     parts.append(f"{passed_n} of {len(results)} injections passed ({len(cases)} faults). {about}.\n")
     parts.append(_worst(data["results"]))
