@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from drivers.dynamixel.ph54 import Ph54Rotator
-from graderd.api import make_app
+from graderd.api.app import make_app
 from graderd.api.server import serve
 from graderd.config import Config, ConfigError, load
 from graderd.core import commands as cmd
