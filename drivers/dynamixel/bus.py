@@ -12,14 +12,14 @@ import asyncio
 import functools
 import logging
 import os
-from collections import deque
 from collections.abc import Callable
-from typing import Literal
+from typing import Final, Literal
 
 import serial
 
 from drivers.dynamixel import ports
 from drivers.dynamixel.codec import BROADCAST_ID, Instruction, Packet, StatusError, StreamDecoder, encode
+from drivers.dynamixel.turns import Allowance, Turns
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import DeviceError, DeviceLostError, DeviceRefusedError, DeviceTimeoutError
 
@@ -28,16 +28,15 @@ log = logging.getLogger(__name__)
 BusLog = Callable[[float, Literal["tx", "rx"], bytes], None]
 """Called with monotonic seconds, direction and bytes of everything that crosses the wire."""
 
-_BITS_PER_BYTE = 10
-_STATUS_BYTES = 11  # a status packet without data
-_PING_DATA_BYTES = 3
-_ALLOWANCE_MIN_S = 0.020
-_ALLOWANCE_START_S = 0.060
-_ALLOWANCE_MAX_S = 0.100
-"""Bounds of what a reply may take beyond wire time: scheduling at the low end, a bad USB adapter at the high one."""
+_BITS_PER_BYTE: Final = 10
+_STATUS_BYTES: Final = 11  # a status packet without data
+_PING_DATA_BYTES: Final = 3
 
-_encode_read = functools.lru_cache(maxsize=64)(encode)
-"""Polling asks the same few questions for ever."""
+
+@functools.lru_cache(maxsize=64)  # polling asks the same few questions for ever
+def _read_packet(servo_id: int, address: int, size: int) -> bytes:
+    params = bytes((address & 0xFF, address >> 8, size & 0xFF, size >> 8))
+    return encode(servo_id, Instruction.READ, params)
 
 
 class ServoRefusedError(DeviceRefusedError):
@@ -85,15 +84,12 @@ class ServoBus:
         self._serial: serial.Serial | None = None
         self._fd = -1
         self._decoder = StreamDecoder()
-        self._busy = False
-        self._queue: deque[asyncio.Future[None]] = deque()
+        self._turns = Turns()
+        self._allowance = Allowance()
         self._reply: asyncio.Future[Packet | None] | None = None
         self._wanted_id = 0
         self._wanted_data_n: int | None = None
         self._suspect = False
-        self._smooth_s = 0.0
-        self._spread_s = 0.0
-        self._allowance_s = _ALLOWANCE_START_S
         self._counters = dict.fromkeys(
             (
                 "requests_n", "replies_n", "retries_n", "timeouts_n", "refused_n", "foreign_n", "late_n", "echo_n",
@@ -156,6 +152,11 @@ class ServoBus:
         }
 
     @property
+    def allowance_s(self) -> float:
+        """What a reply may take now beyond its time on the wire."""
+        return self._allowance.now_s
+
+    @property
     def damaged_n(self) -> int:
         """Replies that came and were not valid."""
         return self._decoder.crc_errors_n + self._counters["invalid_n"]
@@ -180,8 +181,7 @@ class ServoBus:
         """
         if size == _PING_DATA_BYTES or size <= 0:
             raise ValueError(f"a read of {size} bytes could not be told from other replies")
-        params = bytes((address & 0xFF, address >> 8, size & 0xFF, size >> 8))
-        return await self.request(servo_id, Instruction.READ, params, size, attempts_n=attempts_n)
+        return await self._ask(servo_id, _read_packet(servo_id, address, size), size, attempts_n, False)
 
     async def write(
         self, servo_id: int, address: int, data: bytes, *, attempts_n: int = 2, urgent: bool = False
@@ -197,13 +197,13 @@ class ServoBus:
 
     async def send(self, servo_id: int, instruction: int, params: bytes = b"") -> None:
         """Send an instruction that nobody answers (broadcasts; a servo whose status return level is unknown)."""
-        await self._acquire(False)
+        await self._turns.take(False)
         try:
             self._transmit(encode(servo_id, instruction, params))
             await asyncio.sleep(self._byte_s * (12 + len(params)) + self._return_delay_s)
             self._suspect = servo_id != BROADCAST_ID  # should it answer after all, that is not the next one's reply
         finally:
-            self._release()
+            self._turns.give_back()
 
     async def request(
         self,
@@ -225,12 +225,17 @@ class ServoBus:
             DeviceTimeoutError: no valid reply in any attempt.
             DeviceLostError: the port is gone.
         """
-        packet = (_encode_read if instruction == Instruction.READ else encode)(servo_id, instruction, params)
+        return await self._ask(servo_id, encode(servo_id, instruction, params), reply_data_n, attempts_n, urgent)
+
+    async def _ask(
+        self, servo_id: int, packet: bytes, reply_data_n: int | None, attempts_n: int, urgent: bool
+    ) -> Packet:
+        turns = self._turns
         for attempt in range(attempts_n):
-            if self._busy:
-                await self._acquire(urgent)
+            if turns.taken:
+                await turns.take(urgent)
             else:
-                self._busy = True
+                turns.taken = True
             try:
                 if attempt:
                     self._counters["retries_n"] += 1
@@ -238,19 +243,19 @@ class ServoBus:
                     continue
                 reply = await self._exchange(packet, servo_id, reply_data_n)
             finally:
-                self._release()
+                turns.give_back()
             if reply is None:
                 continue
             error = reply.error
-            if error == StatusError.NONE:
+            if not error:
                 return reply
             if error == StatusError.CRC and attempt + 1 < attempts_n:
                 continue
             self._counters["refused_n"] += 1
-            raise ServoRefusedError(self._where(servo_id), _describe(instruction, params), error)
+            raise ServoRefusedError(self._where(servo_id), _describe(packet), error)
         raise DeviceTimeoutError(
             self._where(servo_id),
-            f"no valid status packet to {_describe(instruction, params)} in {attempts_n} attempt(s)",
+            f"no valid status packet to {_describe(packet)} in {attempts_n} attempt(s)",
             "Check power, cable, id and baud rate",
         )
 
@@ -278,7 +283,7 @@ class ServoBus:
         started_s = loop.time()
         try:
             self._transmit(packet)
-            timer = loop.call_at(started_s + on_wire_s + self._allowance_s, self._on_deadline, reply)
+            timer = loop.call_at(started_s + on_wire_s + self._allowance.now_s, self._on_deadline, reply)
             try:
                 answer: Packet | None = await reply
             finally:
@@ -292,50 +297,16 @@ class ServoBus:
             self._suspect = True
             self.unanswered_n += 1
             self._counters["timeouts_n"] += 1
-            self._allowance_s = min(_ALLOWANCE_MAX_S, self._allowance_s * 1.5)
+            self._allowance.widen()
             return None
-        self._learn(max(0.0, loop.time() - started_s - on_wire_s))
+        self._allowance.learn(max(0.0, loop.time() - started_s - on_wire_s))
         return answer
-
-    def _learn(self, extra_s: float) -> None:
-        """Smoothed mean and spread of what replies take beyond wire time set the next deadline (RFC 6298)."""
-        self._spread_s += 0.25 * (abs(extra_s - self._smooth_s) - self._spread_s)
-        self._smooth_s += 0.125 * (extra_s - self._smooth_s)
-        self._allowance_s = min(
-            _ALLOWANCE_MAX_S, max(_ALLOWANCE_MIN_S, self._smooth_s + 4 * self._spread_s + 0.25 * _ALLOWANCE_MIN_S)
-        )
 
     def _on_deadline(self, reply: asyncio.Future[Packet | None]) -> None:
         if not reply.done():
             self._on_readable()  # a busy loop may be late for bytes that were in time
         if not reply.done():
             reply.set_result(None)
-
-    # -- turns on the wire --------------------------------------------------------------------------------------
-
-    async def _acquire(self, urgent: bool) -> None:
-        if not self._busy:
-            self._busy = True
-            return
-        turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        if urgent:
-            self._queue.appendleft(turn)
-        else:
-            self._queue.append(turn)
-        try:
-            await turn
-        except asyncio.CancelledError:
-            if turn.done() and not turn.cancelled():
-                self._release()
-            raise
-
-    def _release(self) -> None:
-        while self._queue:
-            turn = self._queue.popleft()
-            if not turn.done():
-                turn.set_result(None)  # the line stays busy: it goes over to the next one
-                return
-        self._busy = False
 
     # -- bytes --------------------------------------------------------------------------------------------------
 
@@ -394,10 +365,12 @@ class ServoBus:
             reply.set_result(packet)
 
 
-def _describe(instruction: int, params: bytes) -> str:
-    name = (
-        Instruction(instruction).name.lower() if instruction in Instruction.__members__.values() else hex(instruction)
-    )
-    if instruction in (Instruction.READ, Instruction.WRITE, Instruction.REG_WRITE) and len(params) >= 2:
-        return f"{name} at address {params[0] | params[1] << 8}"
+def _describe(packet: bytes) -> str:
+    """A request in words."""
+    instruction = packet[7]
+    if instruction not in Instruction.__members__.values():
+        return hex(instruction)
+    name = Instruction(instruction).name.lower()
+    if instruction in (Instruction.READ, Instruction.WRITE, Instruction.REG_WRITE):
+        return f"{name} at address {packet[8] | packet[9] << 8}"
     return name

@@ -11,9 +11,13 @@ Source: ROBOTIS e-manual, "DYNAMIXEL Protocol 2.0", https://emanual.robotis.com/
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import functools
+import struct
+from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Final, NamedTuple
 
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST_ID = 0xFE
@@ -72,20 +76,28 @@ def _crc_table() -> tuple[int, ...]:
     return tuple(table)
 
 
-_CRC = _crc_table()
+_CRC: Final = _crc_table()
 
 
-def crc16(data: Iterable[int], start: int = 0) -> int:
-    """CRC-16 (0x8005, not reflected, no final xor) of ``data``, going on from ``start``."""
-    crc = start
-    table = _CRC
-    for byte in data:
-        crc = ((crc << 8) & 0xFF00) ^ table[(crc >> 8) ^ byte]
+@functools.cache
+def _word_table() -> array[int]:
+    """The CRC of every pair of bytes; made at the first use, as not every importer needs one."""
+    firsts = [((crc << 8) & 0xFF00) ^ _CRC[crc >> 8] for crc in _CRC]
+    return array("H", [first ^ second for first in firsts for second in _CRC])
+
+
+def crc16(data: bytes | bytearray, start: int = 0) -> int:
+    """CRC-16 (0x8005, not reflected, no final xor) of ``data``, going on from ``start``; two bytes a step."""
+    crc, odd = start, len(data) & 1
+    if odd:
+        crc = ((crc << 8) & 0xFF00) ^ _CRC[(crc >> 8) ^ data[0]]
+    table = _word_table()
+    for word in struct.unpack_from(f">{len(data) >> 1}H", data, odd):
+        crc = table[crc ^ word]
     return crc
 
 
-@dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(NamedTuple):
     """One packet whose CRC was right.
 
     ``params``: without stuffing; of a status packet the first byte is the error byte. ``raw``: as it was on the wire.
@@ -216,6 +228,8 @@ class StreamDecoder:
     def feed(self, data: bytes) -> list[Packet]:
         """Take in bytes; returns the packets that are complete now, in order."""
         buffer = self._buffer
+        if not buffer and (packet := _whole(data, self._max_length)) is not None:
+            return [packet]  # as it mostly comes: one packet in one piece
         buffer += data
         packets: list[Packet] = []
         while buffer:
@@ -234,7 +248,7 @@ class StreamDecoder:
             if len(buffer) < end:
                 return packets
             raw = bytes(buffer[:end])
-            if crc16(raw[:-2]) != raw[-2] | raw[-1] << 8:
+            if not _crc_fits(raw):
                 self.crc_errors_n += 1
                 self._drop(1)
                 continue
@@ -249,6 +263,20 @@ class StreamDecoder:
     def _drop(self, count: int) -> None:
         self.stray_n += count
         del self._buffer[:count]
+
+
+def _whole(data: bytes, max_length: int) -> Packet | None:
+    """The packet that ``data`` is from its first to its last byte; None where it is anything else."""
+    length = len(data) - _OVERHEAD
+    if not 3 <= length <= max_length or data[5] | data[6] << 8 != length or not data.startswith(HEADER):
+        return None
+    if not (data[4] <= MAX_ID or data[4] == BROADCAST_ID) or not _crc_fits(data):
+        return None
+    return _packet(data)
+
+
+def _crc_fits(raw: bytes) -> bool:
+    return crc16(raw[:-2]) == raw[-2] | raw[-1] << 8
 
 
 def _header_prefix(buffer: bytearray) -> int:

@@ -343,4 +343,4 @@ async def test_deadlines_follow_the_line(bus: ServoBus, servos: VirtualServoBus)
     servos.clear_faults()
     for _ in range(40):
         await bus.ping(1, attempts_n=6)
-    assert bus._allowance_s < 0.05
+    assert bus.allowance_s < 0.05
