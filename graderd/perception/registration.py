@@ -30,6 +30,12 @@ HYPOTHESES_N = 64
 VOTERS_N = 100
 NOMINAL_WIDTH_PX = 848
 FACE_POINTS_N = 2000
+FACE_BAND_M = 0.16
+"""The face is looked for from its upper edge down to here."""
+PLACE_M = 0.01
+LEVEL_M = 0.015
+UPRIGHT_LEVELS_N = 4
+"""Soil at 45 degrees shows in no more than 3 levels within two places (2 cm)."""
 TOP_COLUMNS_N = 24
 EDGE_ANGLE_STEP_DEG = 0.5
 KEPT_COLUMNS_N = 256
@@ -287,31 +293,47 @@ class BladeFinder:
         half = blade.length_m / 2
         top = blade.bottom_z_m + blade.height_m
         face = d + setback  # 0 on the face
-        upper = (z > top - 0.16) & (z < top - 0.01) & (np.abs(s) < half + self.SEARCH_M)
+        upper = (z > top - FACE_BAND_M) & (z < top - 0.01) & (np.abs(s) < half + self.SEARCH_M)
         near = np.flatnonzero(upper & (np.abs(face) < self.SEARCH_M))
         if near.size < 40:
             return BladeFix()
         near = near[:: max(1, near.size // FACE_POINTS_N)]
         near_s, near_face = s[near], face[near]
         column = ((near_s + np.float32(half)) * np.float32(self.COLUMNS_N / blade.length_m)).astype(np.int32)
-        at, medians = [], []
-        for i in range(self.COLUMNS_N):
-            inside = near_face[column == i]
-            if inside.size >= 8:
-                # The face is the rearmost surface: soil and hoses lie ahead of it.
-                at.append((i + 0.5) / self.COLUMNS_N * blade.length_m - half)
-                middle = inside.size * 7 // 20
-                medians.append(float(np.partition(inside, middle)[middle]))
-        if len(at) < self.COLUMNS_N // 2:
+        inside = (column >= 0) & (column < self.COLUMNS_N)
+        face_at, upright = self._upright(column[inside], near_face[inside], top - z[near][inside])
+        s_at = (np.flatnonzero(upright) + 0.5) / self.COLUMNS_N * blade.length_m - half
+        if s_at.size < self.COLUMNS_N // 3:
             return BladeFix()
-        s_at, face_at = np.asarray(at), np.asarray(medians)
-        first, second = np.triu_indices(len(at), 3)
+        first, second = np.triu_indices(s_at.size, 3)
         slopes = (face_at[second] - face_at[first]) / (s_at[second] - s_at[first])
         slope = float(np.median(slopes)) if slopes.size else 0.0
         ahead = float(np.median(face_at - slope * s_at))
         on_face = np.abs(near_face - np.float32(ahead) - np.float32(slope) * near_s) < 0.015
         along = self._ends(near_s[on_face])
         return BladeFix(ahead, along, -float(np.degrees(np.arctan(slope))), float(on_face.mean()), 0.0)
+
+    def _upright(self, column: npt.NDArray[np.int32], face: F32, below_m: F32) -> tuple[F64, npt.NDArray[np.bool_]]:
+        """Per column where the face stands, for the columns in which something upright is seen, and which those are.
+
+        What stands upright shows at the same place at many heights. Soil that leans on the face, up to the edge where
+        the blade casts it aside, shows at each height at another place; hoses and rods are narrow and lie ahead.
+        """
+        places_n = round(2 * self.SEARCH_M / PLACE_M)
+        place = ((face + np.float32(self.SEARCH_M)) * np.float32(1 / PLACE_M)).astype(np.int32)
+        place = np.minimum(place, places_n - 1)
+        levels_n = round(FACE_BAND_M / LEVEL_M)
+        level = np.clip((below_m * np.float32(1 / LEVEL_M)).astype(np.int32), 0, levels_n - 1)
+        shape = (self.COLUMNS_N, places_n, levels_n)
+        index = (column * places_n + place) * levels_n + level
+        shown = np.bincount(index, minlength=self.COLUMNS_N * places_n * levels_n).reshape(shape) > 0
+        two = shown[:, 1:] | shown[:, :-1]  # a face lies across the bound of two places as well as on one
+        tall = two.sum(axis=2)
+        best = tall.argmax(axis=1)  # the rearmost where several are as tall
+        upright = tall[np.arange(self.COLUMNS_N), best] >= UPRIGHT_LEVELS_N
+        on_it = (place == best[column]) | (place == best[column] + 1)
+        middles = [float(np.median(face[on_it & (column == i)])) for i in np.flatnonzero(upright)]
+        return np.asarray(middles, dtype=np.float64), upright
 
     def _ends(self, s: F32) -> float:
         if s.size < 60:

@@ -10,6 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from drivers.rig.blade import BladePose
+from drivers.rig.ground import SceneState
+from drivers.rig.look import Look
+from drivers.rig.piles import SceneZone
+from drivers.rig.renderer import Renderer
+from drivers.rig.world import World, scene_heights
 from graderd.core.blade import BladeGeometry
 from graderd.core.zones import SoilObservation, Zone
 from graderd.hal.camera import Frame
@@ -145,6 +151,26 @@ def test_a_mount_that_gives_a_little_is_not_knocked(zone: Zone, sign: int) -> No
     observation = judge(picture(pose, zone=zone))
     assert named(observation) == []
     assert observation.zone is zone
+
+
+def test_soil_heaped_against_the_face_is_not_taken_for_the_face() -> None:
+    """Driving through an even layer at 45 degrees casts soil aside until it hides the trailing end of the blade."""
+    angle_deg, world = 45.0, World()
+    pose = BladePose(angle_deg=angle_deg)
+    world.lay(scene_heights(SceneZone.EVEN, world.vehicle.x_m, BladePose(), 1))
+    world.vehicle.drive(0.6, 2.4)
+    for _ in range(450):
+        world.step(0.01, pose)
+    left_l, _, right_l = world.volumes_l()
+    assert left_l > 1.7 * right_l
+    renderer = Renderer((640, 400), (424, 240), seed=3)
+    seen = SceneState(world.field.heights_m.astype(np.float32), world.field.cell_m, world.vehicle.x_m, pose)
+    color, depth = renderer.render(seen, Look())
+    frame = Frame(color, depth, renderer.color_intrinsics, renderer.depth_intrinsics, 0.0)
+    classifier = make_classifier(PerceptionSettings(), CameraCalibration(), BladeGeometry(), live=False)
+    observation = classifier.classify(frame, angle_deg, 0.01)
+    assert named(observation) == []
+    assert observation.volume_left_l == pytest.approx(left_l, rel=0.15)
 
 
 def test_an_old_blade_angle_is_unknown_without_a_fault_of_the_picture() -> None:
