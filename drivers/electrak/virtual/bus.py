@@ -13,7 +13,7 @@ import can
 from drivers.electrak.j1939.ids import Frame
 from drivers.electrak.virtual import faults
 from drivers.electrak.virtual.model import VirtualElectrak
-from drivers.electrak.virtual.peers import Flood, RivalController
+from drivers.electrak.virtual.peers import LOWEST_PRIORITY_NAME, Flood, RivalController
 from drivers.electrak.virtual.slcan import SlcanAdapter
 from drivers.electrak.virtual.wire import Listener, Wire, WireBus
 from graderd.hal.clock import Clock, SystemClock
@@ -157,9 +157,9 @@ class VirtualActuatorBus:
         """Switch a fault on: of the unit at ``address`` (None: all units), or of the bus.
 
         Bus faults and their parameters: ``flood`` rate_hz 2000; ``address_conflict`` at_address 231: a controller
-        with our own NAME; ``claim_storm`` at_address 231, rate_hz 200: a controller whose NAME wins and who claims
-        without end; ``bus_off``, ``error_passive``, ``overrun``: as the adapter or kernel reports them;
-        ``adapter_hung``: the adapter no longer reads.
+        with our own NAME; ``claim_storm`` at_address 231, rate_hz 200, wins 1: a controller who claims without end, and
+        whose NAME wins (0: loses) every arbitration; ``bus_off``, ``error_passive``, ``overrun``: as the adapter or
+        kernel reports them; ``adapter_hung``: the adapter no longer reads.
 
         Raises:
             ValueError: no such fault, or no unit at that address.
@@ -180,7 +180,8 @@ class VirtualActuatorBus:
                 self._rival = RivalController(int(params.get("at_address", 231)))
             case "claim_storm":
                 rate_hz = params.get("rate_hz", 200.0)
-                self._rival = RivalController(int(params.get("at_address", 231)), name=1, claims_hz=rate_hz)
+                name = 1 if params.get("wins", 1.0) else LOWEST_PRIORITY_NAME
+                self._rival = RivalController(int(params.get("at_address", 231)), name=name, claims_hz=rate_hz)
             case "adapter_hung":
                 if self._adapter is not None:
                     self._adapter.set_deaf(True)

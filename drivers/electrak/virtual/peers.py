@@ -5,16 +5,19 @@ from __future__ import annotations
 import random
 from typing import Final
 
-from drivers.electrak.j1939.ids import GLOBAL, Frame, Pgn, make_id, pgn_of, source_of
+from drivers.electrak.j1939.ids import GLOBAL, NULL, Frame, Pgn, make_id, pgn_of, source_of
 
 _FLOOD_MAX_N: Final = 200
+_ASK_FOR_CLAIMS: Final = Pgn.ADDRESS_CLAIMED.to_bytes(3, "little")
+LOWEST_PRIORITY_NAME: Final = (1 << 64) - 1
 
 
 class RivalController:
     """A second controller that wants an address and answers every claim for it at once, without any limit.
 
     ``name`` is its NAME; None copies the NAME of whoever claims, so that arbitration cannot end (two controllers
-    with equal NAMEs). ``claims_hz`` claims without being asked as well (a claim storm).
+    with equal NAMEs); such a one first asks who is there, as every node does that joins. ``claims_hz`` claims without
+    being asked as well (a claim storm).
     """
 
     def __init__(self, address: int, name: int | None = None, claims_hz: float = 0.0) -> None:
@@ -22,6 +25,7 @@ class RivalController:
         self._name = name
         self._claims_hz = claims_hz
         self._due_s = 0.0
+        self._joined = False
         self.heard_n = 0
         """Claims of others for this address."""
         self.sent_n = 0
@@ -34,10 +38,13 @@ class RivalController:
         return [self._claim(int.from_bytes(frame.data, "little"))]
 
     def advance(self, now_s: float) -> list[Frame]:
-        """Claims sent unasked up to ``now_s``."""
-        if not self._claims_hz or self._name is None:
-            return []
-        out = []
+        """What is sent unasked up to ``now_s``."""
+        if self._name is None:
+            joined, self._joined = self._joined, True
+            return [] if joined else [Frame(make_id(6, Pgn.REQUEST, NULL, GLOBAL), _ASK_FOR_CLAIMS)]
+        out: list[Frame] = []
+        if not self._claims_hz:
+            return out
         self._due_s = max(self._due_s, now_s - 0.1)
         while self._due_s <= now_s:
             self._due_s += 1.0 / self._claims_hz

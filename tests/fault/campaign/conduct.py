@@ -67,6 +67,11 @@ def must_stand(fault: str, before: str) -> tuple[str, ...]:
     return axes_of(held_by(fault))
 
 
+def decisive(case: Case, outcome: Outcome) -> str:
+    """The fault whose row says what must happen."""
+    return outcome.named if case.either and outcome.named else case.faults[0]
+
+
 async def make_ready(stack: Stack) -> None:
     """Armed, manual, standing, without any fault: where every injection begins and where a recovery must lead."""
     await stack.rest()
@@ -195,7 +200,7 @@ async def detect(stack: Stack, case: Case, outcome: Outcome, from_s: float) -> N
         status = await stack.read_status()
         named = [] if status is None else [f for f in status["faults"] if f["name"] in case.faults]
         if status is not None and named and status["time_s"] >= from_s:
-            outcome.detected = True
+            outcome.detected, outcome.named = True, named[0]["name"]
             outcome.detection_s = max(0.0, status["time_s"] - from_s)
             outcome.message = f"{named[0]['reads']} ({named[0]['detail']})"
             if outcome.detection_s > case.detect_s + SLACK_S:
@@ -208,7 +213,7 @@ async def detect(stack: Stack, case: Case, outcome: Outcome, from_s: float) -> N
 
 async def react(stack: Stack, case: Case, outcome: Outcome, from_s: float, before: str) -> None:
     """Mode, standstill and limits, against the catalogue."""
-    fault, watch = case.faults[0], stack.watch
+    fault, watch = decisive(case, outcome), stack.watch
     outcome.expected_state = expected_mode(row_of(fault).reaction, before)
     with suppress(CampaignError):
         await stack.until_status(lambda s: s["mode"] == outcome.expected_state, 1.0, "the mode does not change")
@@ -267,20 +272,19 @@ def _judge(stack: Stack, case: Case, outcome: Outcome, from_s: float) -> bool:
 
 async def recover(stack: Stack, case: Case, outcome: Outcome, before: str) -> None:
     """Take the cause away; see the fault go, or stay, and the machine come back, as the catalogue says."""
-    row = row_of(case.faults[0])
+    fault = decisive(case, outcome)
+    row = row_of(fault)
     await stack.rest()
     await case.repair(stack)
     way = []
     mode = outcome.final_state
     try:
         if row.clear is Clear.WHEN_GONE:
-            await stack.until_status(
-                lambda s: not _named(s, case.faults), case.recover_s, f"{case.faults[0]} does not go away"
-            )
+            await stack.until_status(lambda s: not _named(s, case.faults), case.recover_s, f"{fault} does not go away")
         else:
             await asyncio.sleep(LATCHED_S)
             if outcome.detected and not _named(await stack.read_status() or {}, case.faults):
-                raise CampaignError(f"{case.faults[0]} went away by itself; the catalogue says: {row.clear}")
+                raise CampaignError(f"{fault} went away by itself; the catalogue says: {row.clear}")
         if case.before_arm is not None:
             await case.before_arm(stack)
             way.append("what the remedy says")
@@ -300,9 +304,7 @@ async def recover(stack: Stack, case: Case, outcome: Outcome, before: str) -> No
         if before == "auto" and row.reaction is Reaction.RETREAT:
             await _retry(stack, "auto", 2.0)
             way.append("auto")
-        await stack.until_status(
-            lambda s: not _named(s, case.faults), 3.0, f"{case.faults[0]} is still there after {way}"
-        )
+        await stack.until_status(lambda s: not _named(s, case.faults), 3.0, f"{fault} is still there after {way}")
         outcome.recovered_as_catalogued = stack.daemon.returncode is None
         outcome.recovery = ", ".join(way) or "by itself"
     except CampaignError as error:

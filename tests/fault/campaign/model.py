@@ -44,6 +44,7 @@ class Outcome:
     phase: str
     detected: bool = False
     detection_s: float | None = None
+    named: str = ""
     safe: bool = False
     standstill_s: float | None = None
     standstill_from: str = "injection"
@@ -74,10 +75,11 @@ Conduct = Callable[["Stack", "Case", Phase, Outcome], Awaitable[None]]
 class Case:
     """One fault of the table.
 
-    ``faults``: names the daemon may give it; the first decides what must happen. ``needs``: the axis that has to be
-    commanded for the fault to show; in a phase where it is not, it is commanded after the injection and times count
-    from there. ``detect_s``: promised time to detection. ``own_motion``: axes the fault itself moves, which no
-    software can stop. ``repair``: takes the cause away. ``before_arm``: what the remedy asks a person to do first.
+    ``faults``: names the daemon may give it; the first decides what must happen. With ``either`` the one that the
+    daemon gave decides: each is as true, and which comes first depends on where the axes are. ``needs``: the axis that
+    has to be commanded for the fault to show; in a phase where it is not, it is commanded after the injection and
+    times count from there. ``detect_s``: promised time to detection. ``own_motion``: axes the fault itself moves, which
+    no software can stop. ``repair``: takes the cause away. ``before_arm``: what the remedy asks a person to do first.
     ``log_errors``: error lines of the daemon's log that belong to the fault. ``conduct``: how it is run where the
     general way does not fit (the daemon itself dies, say). ``short``: phases of the shortened campaign.
     """
@@ -88,6 +90,7 @@ class Case:
     inject: Action
     repair: Action
     needs: str = ""
+    either: bool = False
     detect_s: float = 0.6
     recover_s: float = 12.0
     stand_s: float | None = None

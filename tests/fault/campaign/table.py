@@ -8,10 +8,13 @@ import signal
 from contextlib import suppress
 from typing import Any
 
+from drivers.rig.blade import LEVEL_TILT_MM
 from graderd.hal.errors import DeviceError
 from tests.fault.campaign.model import ROTATION, Action, Case, Phase
 from tests.fault.campaign.stack import Stack
 
+TILT_REACH_MM = 40.0
+"""From level, either way: inside what a new start is permitted at."""
 IDLE, TURNING, LIFTING = Phase.IDLE, Phase.TURNING, Phase.LIFTING
 
 
@@ -40,6 +43,26 @@ def actuator(name: str, device: str | None = None, **params: float) -> Action:
         await stack.ask_rig("actuator_fault", name=name, device=device, params=params)
 
     return inject
+
+
+async def override_tilt(stack: Stack) -> None:
+    """Somebody turns the tilt's manual override, towards the farther end of its stroke."""
+    direction = -1.0 if stack.watch.newest().state["tilt_mm"] > LEVEL_TILT_MM else 1.0
+    await stack.ask_rig("actuator_fault", name="manual_override", device="tilt", params={"direction": direction})
+
+
+async def turn_tilt_back(stack: Stack) -> None:
+    """The override may have left the tilt where operation may not begin: it is turned back by the override as well."""
+
+    def beyond() -> float:
+        return float(stack.watch.newest().state["tilt_mm"]) - LEVEL_TILT_MM
+
+    if abs(beyond()) > TILT_REACH_MM:
+        params = {"direction": -1.0 if beyond() > 0.0 else 1.0}
+        await stack.ask_rig("actuator_fault", name="manual_override", device="tilt", params=params)
+        await stack.until(lambda: abs(beyond()) < TILT_REACH_MM, 5.0, "the override does not turn the tilt back")
+        await stack.heal()
+        await stack.watch.until_still(("tilt",), 0.3, 2.0)
 
 
 def worker(number: signal.Signals) -> Action:
@@ -96,7 +119,8 @@ def _servo(name: str, text: str, faults: str, inject: Action, **more: Any) -> Ca
 
 def _actuator(name: str, text: str, device: str, conditions: str, fault: str, **more: Any) -> Case:
     named = tuple(f"{device}.{condition}" for condition in conditions.split())
-    return Case(f"actuator_{name}", f"{device} {text}", named, actuator(fault, device), heal, **more)
+    inject = more.pop("inject", None) or actuator(fault, device)
+    return Case(f"actuator_{name}", f"{device} {text}", named, inject, heal, **more)
 
 
 def _can(name: str, text: str, fault: str, inject: Action, **more: Any) -> Case:
@@ -169,16 +193,17 @@ CAN = (
     _can("overrun", "received frames were lost", "queue_overrun", actuator("overrun")),
     _can("flood", "2000 foreign frames a second", "flood", actuator("flood"), detect_s=1.6, short=(TURNING,)),
     _can("equal_address", "a node with our address and NAME", "address_conflict", actuator("address_conflict")),
-    _can("claim_storm", "a node claims our address without end", "claim_storm", actuator("claim_storm"), detect_s=1.0),
-)
+    _can("claim_storm", "a node claims our address without end", "claim_storm", actuator("claim_storm", wins=0.0),
+         detect_s=1.0),
+)  # fmt: skip
 
 ACTUATOR = (
     _actuator("silence", "is not heard", "lift_left", "no_feedback", "silence", short=(IDLE, LIFTING)),
     _actuator("power_cut", "loses power", "lift_right", "no_feedback", "power_cut"),
     _actuator("restart", "restarts", "tilt", "restarted", "restart", detect_s=1.5),
     _actuator("garbage", "sends garbage", "lift_left", "implausible_feedback no_feedback", "garbage", detect_s=1.0),
-    _actuator("lying", "repeats its last position", "lift_left", "not_moving", "frozen_feedback",
-              needs="lift", detect_s=1.6),
+    _actuator("lying", "repeats its last position", "lift_left", "not_moving sides_apart", "frozen_feedback",
+              needs="lift", detect_s=1.6, either=True),
     _actuator("babble", "sends 500 messages a second", "tilt", "feedback_flood", "babble", detect_s=1.0),
     _actuator("wrong_address", "answers at another address", "lift_right", "wrong_address", "wrong_address",
               detect_s=0.8),
@@ -187,8 +212,7 @@ ACTUATOR = (
     _actuator("drift", "is moved by its load", "lift_right", "uncommanded_motion backdrive", "drift", detect_s=2.5,
               own_motion=frozenset({"lift_right"})),
     _actuator("override", "is moved by its manual override", "tilt", "uncommanded_motion", "manual_override",
-              detect_s=2.0,
-              own_motion=frozenset({"tilt"})),
+              inject=override_tilt, detect_s=2.0, before_arm=turn_tilt_back, own_motion=frozenset({"tilt"})),
     _actuator("overload", "carries 4000 N", "lift_left", "overload", "overload", needs="lift", detect_s=1.5),
     _actuator("fatal", "reports a fatal error", "tilt", "fatal", "fatal", short=(TURNING,)),
     _actuator("low_voltage", "gets 8 V", "lift_left", "voltage", "voltage_low", detect_s=1.0),
