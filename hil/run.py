@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hil import uml
+from hil.shutdown import judge
 
 PROJECT = Path(__file__).resolve().parent.parent
 PYTHON = PROJECT / ".venv" / "bin" / "python"
@@ -30,6 +32,17 @@ class Part:
     name: str
     suite: str
     timeout_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How one run ended."""
+
+    status: int
+    took_s: float
+
+    def __str__(self) -> str:
+        return f"{'passed' if not self.status else 'FAILED'} in {self.took_s:.0f} s"
 
 
 def newest_package() -> Path:
@@ -62,6 +75,7 @@ def in_guest(part: Part, package: Path, *, follow: bool) -> int:
     """Run one part in a guest; its log, journal and console stay under var/hil/PART."""
     command = (str(PYTHON), "-m", "hil.suite", part.suite, str(package))
     out = RESULTS / part.name
+    shutil.rmtree(out, ignore_errors=True)
     status = uml.Guest(command, out, directory=PROJECT, timeout_s=part.timeout_s).run(follow=follow)
     if status in (uml.TIMED_OUT, uml.GUEST_DIED):
         sys.stderr.write(
@@ -72,39 +86,12 @@ def in_guest(part: Part, package: Path, *, follow: bool) -> int:
 
 def judge_shutdown() -> int:
     """The verdict on the shutdown that followed the suite; 0 where the machine was brought to a stand."""
-    from hil.shutdown import judge
-
-    record = RESULTS / "suite" / "shutdown.log"
-    wrong = judge(record) if record.exists() else ["nothing was recorded"]
+    if not (RESULTS / "suite" / "graceful").exists():
+        sys.stdout.write("hil: shutdown: not tried, for its test did not run to its end\n")
+        return 0  # The suite's own status tells of a test that failed.
+    wrong = judge(RESULTS / "suite" / "shutdown.log")
     sys.stdout.write("".join(f"hil: shutdown: {line}\n" for line in wrong or ["the blade stood, motion was disabled"]))
     return 1 if wrong else 0
-
-
-def main() -> int:
-    """Command line; the first status that is not 0."""
-    parser = argparse.ArgumentParser(prog="make hil", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--part", choices=["suite", "soak", "both"], default="both")
-    parser.add_argument("--soak-s", type=float, default=120.0, help="length of the soak in seconds")
-    parser.add_argument("--guest", action="store_true", help="in a guest even where it could run here")
-    options = parser.parse_args()
-    os.environ["GRADERD_SOAK_S"] = str(options.soak_s)
-    package, began_s = newest_package(), time.monotonic()
-    why = "asked for" if options.guest else can_run_here()
-    if not why:
-        sys.stdout.write("hil: on this machine's own kernel\n")
-        parts = [p for p in ("all", "soak") if options.part in ("both", {"all": "suite"}.get(p, p))]
-        results = [
-            subprocess.run([PYTHON, "-m", "hil.suite", p, package], cwd=PROJECT, check=False).returncode for p in parts
-        ]
-    else:
-        if absent := uml.missing():
-            sys.stderr.write(f"hil: no {', '.join(absent)}. Run `sudo hil/setup` once\n")
-            return uml.GUEST_DIED
-        sys.stdout.write(f"hil: in user-mode Linux ({why})\n")
-        sys.stdout.flush()
-        results = in_guests(package, options.part, options.soak_s)
-    sys.stdout.write(f"hil: {'passed' if not any(results) else 'FAILED'} in {time.monotonic() - began_s:.0f} s\n")
-    return next((status for status in results if status), 0)
 
 
 def in_guests(package: Path, part: str, soak_s: float) -> list[int]:
@@ -119,6 +106,56 @@ def in_guests(package: Path, part: str, soak_s: float) -> list[int]:
             if part == "both":
                 sys.stdout.write((RESULTS / soak.name / "log").read_text(encoding="utf-8", errors="replace"))
     return results
+
+
+def on_this_machine(package: Path, part: str) -> list[int]:
+    """The same without a guest, one after the other; the machine is not shut down."""
+    wanted = {"suite": ["all"], "soak": ["soak"], "both": ["all", "soak"]}[part]
+    return [
+        subprocess.run([PYTHON, "-m", "hil.suite", name, package], cwd=PROJECT, check=False).returncode
+        for name in wanted
+    ]
+
+
+def keep_failed(number: int) -> None:
+    """Put the results of a run that failed where the next one does not overwrite them."""
+    for part in ("suite", "soak"):
+        if (RESULTS / part).exists():
+            kept = RESULTS / f"failed-{number}" / part
+            shutil.rmtree(kept, ignore_errors=True)
+            shutil.copytree(RESULTS / part, kept)
+
+
+def main() -> int:
+    """Command line; 0 where every run passed."""
+    parser = argparse.ArgumentParser(prog="make hil", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--part", choices=["suite", "soak", "both"], default="both")
+    parser.add_argument("--soak-s", type=float, default=120.0, help="length of the soak in seconds")
+    parser.add_argument("--guest", action="store_true", help="in a guest even where it could run here")
+    parser.add_argument("--repeat", type=int, default=1, metavar="N", help="so many runs in a row, all of them")
+    options = parser.parse_args()
+    os.environ["GRADERD_SOAK_S"] = str(options.soak_s)
+    package = newest_package()
+    why = "asked for" if options.guest else can_run_here()
+    if why and (absent := uml.missing()):
+        sys.stderr.write(f"hil: no {', '.join(absent)}. Run `sudo hil/setup` once\n")
+        return uml.GUEST_DIED
+    sys.stdout.write(f"hil: in user-mode Linux ({why})\n" if why else "hil: on this machine's own kernel\n")
+    sys.stdout.flush()
+    verdicts: list[Verdict] = []
+    for number in range(1, options.repeat + 1):
+        began_s = time.monotonic()
+        results = in_guests(package, options.part, options.soak_s) if why else on_this_machine(package, options.part)
+        verdict = Verdict(next((status for status in results if status), 0), time.monotonic() - began_s)
+        verdicts.append(verdict)
+        if verdict.status:
+            keep_failed(number)
+        sys.stdout.write(f"hil: run {number} of {options.repeat}: {verdict}\n")
+        sys.stdout.flush()
+    if options.repeat > 1:
+        passed_n = sum(not verdict.status for verdict in verdicts)
+        sys.stdout.write(f"hil: {passed_n} of {options.repeat} runs passed\n")
+    return next((verdict.status for verdict in verdicts if verdict.status), 0)
 
 
 if __name__ == "__main__":

@@ -29,8 +29,8 @@ OPTIONS: Final = (
 )
 PARTS: Final = {
     "all": ("-m", "not soak and not shutdown"),
+    "all-and-shutdown": ("-m", "not soak"),
     "soak": ("-m", "soak"),
-    "shutdown": ("-m", "shutdown"),
 }
 
 
@@ -45,12 +45,24 @@ def install(package: Path) -> None:
         subprocess.run(["mount", "-t", "tmpfs", "tmpfs", "/opt"], check=True)
     began_s = time.monotonic()
     done = subprocess.run(
-        ["dpkg", "-i", "--force-unsafe-io", "--no-triggers", str(package)], capture_output=True, text=True, check=False
+        ["dpkg", "-i", "--force-unsafe-io", "--no-triggers", *other_pythons(), str(package)],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
         raise SystemExit(f"hil: {package.name} does not install:\n{done.stdout}{done.stderr}")
     sys.stdout.write(f"hil: {package.name} installed in {time.monotonic() - began_s:.1f} s\n")
     sys.stdout.flush()
+
+
+def other_pythons() -> list[str]:
+    """In a guest the parts for Pythons it does not have are left out, for every file takes its time there."""
+    if not os.environ.get("HIL_GUEST"):
+        return []
+    version = "import sys; print('python%d.%d' % sys.version_info[:2])"
+    own = subprocess.run(["/usr/bin/python3", "-c", version], capture_output=True, text=True, check=True).stdout.strip()
+    return ["--path-exclude=/opt/graderd/lib/python3.*/*", f"--path-include=/opt/graderd/lib/{own}/*"]
 
 
 def pytest(*arguments: str) -> int:
@@ -67,11 +79,7 @@ def main() -> int:
         raise SystemExit("hil.suite: needs root and systemd; use `make hil`, which starts a guest where they are not")
     install(package)
     try:
-        if part != "all-and-shutdown":
-            return pytest(*PARTS[part])
-        status = pytest(*PARTS["all"])
-        os.environ["HIL_SHUTDOWN"] = "1"
-        return pytest(*PARTS["shutdown"]) or status
+        return pytest(*PARTS[part])
     finally:
         if not os.environ.get("HIL_GUEST"):
             subprocess.run(["systemctl", "stop", "graderd.service", "hil-rig.service"], check=False)

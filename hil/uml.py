@@ -93,9 +93,10 @@ class Guest:
             f"{exports}cd {shlex.quote(str(self.directory))} || exit 1\n"
             f"{shlex.join(self.command)}\n"
             'echo $? > "$HIL_OUT/exit.new" && mv "$HIL_OUT/exit.new" "$HIL_OUT/exit"\n'
-            'journalctl --boot --no-pager -o short-monotonic > "$HIL_OUT/journal" 2>&1\n'
-            "# A command that wants the ordinary, ordered shutdown leaves this file.\n"
-            'if [ -e "$HIL_OUT/graceful" ]; then systemctl poweroff --no-block; else systemctl poweroff --force; fi\n'
+            "# A command that wants the ordinary, ordered shutdown leaves this file; hil-journal.service follows it.\n"
+            'if [ -e "$HIL_OUT/graceful" ]; then systemctl poweroff --no-block; exit; fi\n'
+            "systemctl stop hil-journal.service\n"
+            "systemctl poweroff --force\n"
         )
 
     def _command_line(self, initramfs: Path) -> list[str]:

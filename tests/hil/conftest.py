@@ -15,6 +15,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,8 @@ from hil.service import Grader, Rig, run
 WIRE = "wire0"
 CAN = "vcan0"
 CORES = Path("/var/tmp/hil-cores")
+# Set by the last test: the machine is turning and shall be found so by the shutdown that follows.
+LEFT_TURNING = pytest.StashKey[bool]()
 DROP_IN = Path("/etc/systemd/system/graderd.service.d")
 # The guest has one processor for machine, computer and test, and each system call costs it 0.1 ms: fewer of them, and
 # 0.2 s longer patience where the whole guest may stand still for that long.
@@ -75,25 +78,30 @@ def pytest_report_header() -> list[str]:
 
 
 @pytest.fixture(scope="session")
-def wire() -> Iterator[str]:
+def wire(request: pytest.FixtureRequest) -> Iterator[str]:
     """The bus: the rig's end and the service's end, coupled."""
     bus.load_modules()
-    with bus.vcan(WIRE), bus.vcan(CAN):
+    with ExitStack() as stack:
+        for name in (WIRE, CAN):
+            stack.enter_context(bus.vcan(name))
         bus.couple(CAN, WIRE)
         yield WIRE
+        if _left_turning(request):
+            stack.pop_all()
 
 
 @pytest.fixture(scope="session")
-def rig(wire: str) -> Iterator[Rig]:
+def rig(request: pytest.FixtureRequest, wire: str) -> Iterator[Rig]:
     """The simulated grader."""
     machine = Rig(wire, seed=int(os.environ.get("GRADERD_HIL_SEED", "0")))
     machine.start()
     yield machine
-    machine.stop()
+    if not _left_turning(request):
+        machine.stop()
 
 
 @pytest.fixture(scope="session")
-def service(rig: Rig) -> Iterator[Grader]:
+def service(request: pytest.FixtureRequest, rig: Rig) -> Iterator[Grader]:
     """The installed service, running and disarmed."""
     CORES.mkdir(exist_ok=True)
     pattern = Path("/proc/sys/kernel/core_pattern")
@@ -108,19 +116,17 @@ def service(rig: Rig) -> Iterator[Grader]:
         encoding="utf-8",
     )
     grader = Grader()
-    grader.configure(rig.configuration() | FOR_THE_GUEST | {"can.channel": CAN})
-    run("systemctl", "daemon-reload")
-    grader.start()
+    grader.start_with(rig.configuration() | FOR_THE_GUEST | {"can.channel": CAN})
     before = _descriptors(grader)
     yield grader
-    if os.environ.get("HIL_SHUTDOWN"):
-        return
     after = _descriptors(grader) if grader.unit.pid else {}
+    assert after.get("socket", 0) <= before["socket"] + 1, f"sockets leaked: {before} -> {after}"
+    if _left_turning(request):
+        return
     grader.unit.ctl("stop")
     assert grader.unit.show("Result") == "success", grader.unit.journal()
     pattern.write_text(former_pattern, encoding="ascii")
-    assert after.get("socket", 0) <= before["socket"] + 1, f"sockets leaked: {before} -> {after}"
-    assert not _bus_users(CAN), _bus_users(CAN)
+    assert not bus_users(CAN), bus_users(CAN)
     assert not Path("/run/graderd").exists()
 
 
@@ -135,8 +141,6 @@ def quiet(request: pytest.FixtureRequest, service: Grader) -> Iterator[None]:
     yield
     errors = watch.drain()
     watch.close()
-    if request.node.get_closest_marker("shutdown"):
-        return
     if not request.node.get_closest_marker("error_frames"):
         assert not errors, f"error frames unasked: {errors[:5]}"
     assert service.unit.restarts_n - before == allowed, service.unit.journal()
@@ -145,12 +149,14 @@ def quiet(request: pytest.FixtureRequest, service: Grader) -> Iterator[None]:
 
 
 @pytest.fixture
-def ready(service: Grader, rig: Rig) -> Iterator[Grader]:
+def ready(request: pytest.FixtureRequest, service: Grader, rig: Rig) -> Iterator[Grader]:
     """The service, disarmed and ready to be armed; disarmed again afterwards."""
     rig.ask("clear_faults")
     service.disarm()
     service.wait_ready()
     yield service
+    if _left_turning(request):
+        return
     if service.unit.state == "active":
         service.disarm()
     rig.ask("clear_faults")
@@ -164,6 +170,10 @@ def listener(wire: str) -> Iterator[bus.RawBus]:
     raw.close()
 
 
+def _left_turning(request: pytest.FixtureRequest) -> bool:
+    return request.session.stash.get(LEFT_TURNING, False)
+
+
 def _descriptors(grader: Grader) -> dict[str, int]:
     kinds: dict[str, int] = {}
     for entry in Path(f"/proc/{grader.unit.pid}/fd").iterdir():
@@ -175,7 +185,7 @@ def _descriptors(grader: Grader) -> dict[str, int]:
     return kinds
 
 
-def _bus_users(interface: str) -> list[str]:
+def bus_users(interface: str) -> list[str]:
     """Receive lists of the kernel that still hold an entry on this interface, apart from the gateway's."""
     found = []
     for path in Path("/proc/net/can").glob("rcvlist_*"):

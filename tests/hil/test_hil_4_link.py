@@ -56,23 +56,21 @@ def test_interface_deleted_and_created_again(ready: Grader) -> None:
 
 
 @pytest.fixture(scope="module")
-def on_adapter(service: Grader, rig: Rig) -> Iterator[slcan.Adapter]:
-    """The service moved to an slcan adapter, which the unit for CAN links has set up."""
-    adapter = slcan.Adapter(WIRE)
-    service.configure({"can.channel": adapter.interface})
-    run("systemctl", "daemon-reload")
-    service.start()
-    yield adapter
-    adapter.unplug()
-    service.configure({"can.channel": CAN})
-    run("systemctl", "daemon-reload")
-    service.start()
+def plugged(service: Grader, rig: Rig) -> Iterator[list[slcan.Adapter]]:
+    """The service moved to an slcan adapter, the last of these, which the unit for CAN links has set up."""
+    adapters = [slcan.Adapter(WIRE)]
+    service.start_with({"can.channel": adapters[0].interface})
+    yield adapters
+    # Back on the virtual bus before the adapter goes.
+    service.start_with({"can.channel": CAN})
+    for adapter in adapters:
+        adapter.unplug()
 
 
 @pytest.fixture
-def adapter(on_adapter: slcan.Adapter, ready: Grader) -> slcan.Adapter:
-    """The adapter, with the service ready on it."""
-    return on_adapter
+def adapter(plugged: list[slcan.Adapter], ready: Grader) -> slcan.Adapter:
+    """The adapter that is plugged in, with the service ready on it."""
+    return plugged[-1]
 
 
 def test_the_link_unit_sets_the_adapter_up(adapter: slcan.Adapter, service: Grader) -> None:
@@ -103,24 +101,18 @@ def test_bus_off_disarms_and_a_restart_of_the_link_brings_it_back(adapter: slcan
     back(service, pid)
 
 
-def test_unplugged_and_plugged_in_again(on_adapter: slcan.Adapter, ready: Grader) -> None:
+def test_unplugged_and_plugged_in_again(plugged: list[slcan.Adapter], ready: Grader) -> None:
     pid = ready.unit.pid
-    interface = on_adapter.interface
+    interface = plugged[-1].interface
     ready.arm("manual")
-    on_adapter.unplug()
+    plugged[-1].unplug()
     ready.wait("told", lambda s: faults(s) & {"can.unplugged", "can.interface_down"}, 4.0)
     ready.wait("disarmed", lambda s: s["mode"] == "disarmed", 3.0)
     wait_for("interface gone", lambda: not interface_exists(interface), 5.0)
     wait_for("link unit stopped", lambda: Unit(f"graderd-can@{interface}.service").state == "inactive", 5.0)
     # The new one: udev tells systemd, systemd sets the link up, the daemon opens it; nobody helps.
     fresh = slcan.Adapter(WIRE)
-    try:
-        assert fresh.interface == interface
-        wait_for("set up", lambda: fresh.bitrate_code == "S5", 10.0)
-        back(ready, pid)
-    finally:
-        # Back on the virtual bus before this adapter goes.
-        ready.configure({"can.channel": CAN})
-        run("systemctl", "daemon-reload")
-        ready.start()
-        fresh.unplug()
+    plugged.append(fresh)
+    assert fresh.interface == interface
+    wait_for("set up", lambda: fresh.bitrate_code == "S5", 10.0)
+    back(ready, pid)
