@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drivers.realsense import RecordingCamera, sdk
+from drivers.realsense import RecordingCamera
 from graderd.core.blade import BladeGeometry
 from graderd.core.zones import Zone
 from graderd.hal.camera import EndOfFrames, Frame
@@ -134,19 +135,47 @@ def test_a_stall_is_not_the_end(recording: Path, monkeypatch: pytest.MonkeyPatch
     camera = camera_of(recording)
     camera.open()
 
-    class Stalled:
-        def try_wait_for_frames(self, _timeout_ms: int) -> tuple[bool, None]:
-            return False, None
-
-        def stop(self) -> None:
-            pipeline.stop()
-
-    class Playing:
-        def current_status(self) -> sdk.Rs:
-            return sdk.load().playback_status.playing
-
-    pipeline = camera._pipeline
-    camera._pipeline, camera._playback = Stalled(), Playing()
+    playback = camera._playback
+    assert playback is not None
+    monkeypatch.setattr(playback, "next", lambda _timeout_s: None)
     with pytest.raises(DeviceTimeoutError):
         camera.read(0.02)
     camera.close()
+
+
+def test_a_slow_reader_loses_nothing(tmp_path: Path) -> None:
+    """More frames than are decoded ahead, and a reader that stops now and then: the playback waits for it."""
+    count = 40
+    path = tmp_path / "long.db3"
+    record(path, pictures(count), SoftD455(COLOR_SIZE, DEPTH_SIZE))
+    camera = camera_of(path)
+    camera.open()
+    numbers = []
+    for read_n in range(count):
+        if read_n % 10 == 3:
+            time.sleep(0.3)
+        frame = camera.read(5.0)
+        numbers.append((frame.color_number, frame.depth_number))
+    with pytest.raises(EndOfFrames):
+        camera.read(5.0)
+    camera.close()
+    assert numbers == [(number, number) for number in range(1, count + 1)]
+
+
+def test_a_whole_recording_over_and_over(recording: Path) -> None:
+    camera = camera_of(recording, repeat=True)
+    camera.open()
+    numbers = [camera.read(5.0).color_number for _ in range(3 * COUNT)]
+    camera.close()
+    assert numbers == 3 * list(range(1, COUNT + 1))
+
+
+def test_closing_in_the_middle_does_not_wait_for_the_rest(tmp_path: Path) -> None:
+    path = tmp_path / "long.db3"
+    record(path, pictures(40), SoftD455(COLOR_SIZE, DEPTH_SIZE))
+    camera = camera_of(path)
+    camera.open()
+    camera.read(5.0)
+    started_s = time.monotonic()
+    camera.close()
+    assert time.monotonic() - started_s < 3.0
