@@ -13,6 +13,7 @@ import threading
 import time
 from bisect import bisect_left
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -40,6 +41,7 @@ from graderd.runtime.worker_protocol import (
 )
 
 JPEG_QUALITY = 80
+OpenSource = Callable[[CameraSettings], Camera]
 
 
 class AngleHistory:
@@ -73,8 +75,9 @@ class AngleHistory:
 class Worker:
     """The child's two threads: one reads the daemon's lines, the main one reads the camera."""
 
-    def __init__(self, start: Start, lines: BinaryIO, out: BinaryIO) -> None:
+    def __init__(self, start: Start, lines: BinaryIO, out: BinaryIO, open_source: OpenSource = open_camera) -> None:
         self._start = start
+        self._open_source = open_source
         self._lines = lines
         self._out = out
         self._angles = AngleHistory()
@@ -103,7 +106,7 @@ class Worker:
         threading.Thread(target=self._listen, name="daemon-lines", daemon=True).start()
         settings = self._start.camera
         try:
-            camera = open_camera(settings)
+            camera = self._open_source(settings)
             if self._start.reset_first:
                 camera.reset_hardware()
             camera.open()
@@ -203,8 +206,8 @@ def settings_not_kept(settings: CameraSettings, read_back: dict[str, float]) -> 
     return tuple(wrong)
 
 
-def main() -> int:
-    """Entry point of the child process."""
+def main(open_source: OpenSource = open_camera) -> int:
+    """Body of the child process; ``open_source`` makes the camera of the daemon's settings. Returns the exit status."""
     cv2.setNumThreads(1)  # one core is the control loop's
     # A camera library that prints must not be able to spoil the protocol: its stdout becomes stderr.
     out = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
@@ -214,7 +217,7 @@ def main() -> int:
     except ValidationError as error:
         sys.stderr.write(f"graderd worker: not started by the daemon: {error.errors()[0]['msg']}\n")
         return 2
-    return Worker(start, sys.stdin.buffer, out).run()
+    return Worker(start, sys.stdin.buffer, out, open_source).run()
 
 
 if __name__ == "__main__":
