@@ -78,6 +78,9 @@ _NEAR_MM: Final = 8.0
 _WAY_MM: Final = 15.0
 """A move shorter than this is start and end only: nothing is learned from it."""
 _TAPER: Final = 0.5
+_SETTLED_SHARE: Final = 0.1
+"""While the acting share is estimated to be further than this from the commanded one, when it acts is a guess (the
+next control message, break-away, soft start): a gain learned then would be one of the guess."""
 _AHEAD_N: Final = 3
 """A side is held back when it is too far ahead in so many steps; a single estimate is too noisy for that."""
 _STILL_MM_PER_S: Final = 2.0
@@ -106,6 +109,7 @@ class _Side:
     share: float = 0.0
     acting_share: float = 0.0
     drive_s: float = 0.0
+    settled: bool = True
     learned: dict[int, tuple[float, float]] = field(default_factory=dict)
     moved_at_s: float = 0.0
     moved_from_mm: float = 0.0
@@ -141,6 +145,7 @@ class _Side:
         """Let time pass."""
         self.acting_share += (self.share - self.acting_share) * min(1.0, elapsed_s / _SHARE_LAG_S)
         self.drive_s += self.acting_share * elapsed_s
+        self.settled = self.settled and abs(self.share - self.acting_share) <= _SETTLED_SHARE
 
     def see(self, reading: SideReading, now_s: float, *, learn: bool) -> None:
         """Take the newest reading (which may be the one of before)."""
@@ -149,10 +154,11 @@ class _Side:
             drive_s = self.drive_s - self.acting_share * max(0.0, now_s - reading.time_s)
             if last is not None:
                 moved_mm = reading.position_mm - last.position_mm
+                moved_before = abs(self.velocity_mm_per_s) > _STILL_MM_PER_S
                 self.velocity_mm_per_s = moved_mm / (reading.time_s - last.time_s)
-                if learn:
+                if learn and self.settled and moved_before:
                     self._learn(moved_mm * self.direction, drive_s - self.reading_drive_s)
-            self.reading, self.reading_drive_s = reading, drive_s
+            self.reading, self.reading_drive_s, self.settled = reading, drive_s, True
         gain = self.gain_mm_per_s
         coming_mm = gain * (self.drive_s - self.reading_drive_s) if gain else 0.0
         remaining_mm = abs(self.target_mm - reading.position_mm)

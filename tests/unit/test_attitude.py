@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 
 import pytest
 from hypothesis import given
@@ -211,9 +212,15 @@ async def alone(machine: Machine, loop: SimulatedLoop, name: str, target_mm: flo
     return loop.now_s() - start_s
 
 
-@pytest.mark.parametrize("slow", ["lift_left", "lift_right"])
-@pytest.mark.parametrize("load_n", [0.0, 800.0])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(
+    ("slow", "load_n", "seed"),
+    [
+        *itertools.product(("lift_left", "lift_right"), (0.0, 800.0), (1, 2)),
+        # here the first messages of a move fell so that its start-up was taken for a slow side
+        ("lift_left", 400.0, 16), ("lift_left", 800.0, 4), ("lift_left", 800.0, 23),
+        ("lift_right", 0.0, 27), ("lift_right", 0.0, 36), ("lift_right", 400.0, 22),
+    ],
+)  # fmt: skip
 def test_a_100_mm_lift_with_one_side_30_percent_slower(slow: str, load_n: float, seed: int) -> None:
     """Never more than 3 mm apart, within 15 % of the slow side's own time: the first lift, and a later one."""
 
@@ -225,8 +232,7 @@ def test_a_100_mm_lift_with_one_side_30_percent_slower(slow: str, load_n: float,
             lift = Lift(machine, loop)
             await asyncio.sleep(0.037 * seed)
             await lift.arm()
-            own_s = await alone(machine, loop, slow, 200.0)
-            await alone(machine, loop, slow, 100.0)
+            own_s = {200.0: await alone(machine, loop, slow, 200.0), 100.0: await alone(machine, loop, slow, 100.0)}
             for unit in machine.units.values():
                 unit.position_mm = 100.0
             await asyncio.sleep(0.6)
@@ -237,8 +243,7 @@ def test_a_100_mm_lift_with_one_side_30_percent_slower(slow: str, load_n: float,
                 took_s = await lift.go(target_mm)
                 assert lift.stopped == ""
                 assert lift.worst_apart_mm <= 3.0
-                if target_mm == 200.0:
-                    assert took_s <= 1.15 * own_s
+                assert took_s <= 1.15 * own_s[target_mm]
 
     run_simulated(main)
 
