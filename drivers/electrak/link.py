@@ -33,6 +33,9 @@ _log = logging.getLogger(__name__)
 
 ACM_PERIOD_S: Final = 0.1
 _POLL_S: Final = 0.02
+_AHEAD_S: Final = 0.0004
+"""Wake-ups come so much before their time: more than waking up and encoding mostly take, so that control messages keep
+their period to some microseconds. What is left of it is spun, ten times a second."""
 _BACKOFF_FIRST_S: Final = 0.1
 _BACKOFF_MAX_S: Final = 2.0
 _CLOSE_REPEATS_N: Final = 3
@@ -223,12 +226,8 @@ class CanLink:
 
     def send_control(self, user: LinkUser) -> bool:
         """Send one actuator's control message now; False where that is impossible."""
-        address = self._node.address
-        if self._port is None or address is None:
-            return False
-        now_s = self._clock.now_s()
-        can_id = make_id(_ACM_PRIORITY, Pgn.PROPRIETARY_A, address, user.address)
-        return self._send(Frame(can_id, user.control_data(now_s)))
+        frame = self._control(user)
+        return frame is not None and self._send(frame)
 
     def request(self, pgn: int, destination: int = 0xFF) -> None:
         """Ask for a parameter group; the answer comes through :meth:`tap_messages`."""
@@ -239,6 +238,14 @@ class CanLink:
         """Send the daemon's faults as DM1: amber lamp with any fault, red stop lamp while ``stopped``."""
         dtcs = sorted({dm1.dtc_of(fault.device, fault.condition) for fault in faults}, key=lambda d: (d.spn, d.fmi))
         self._node.publish(dtcs, amber=bool(dtcs), red=stopped, now_s=self._clock.now_s())
+
+    def _control(self, user: LinkUser) -> Frame | None:
+        """An actuator's control message as it is now; None while nothing can be sent."""
+        address = self._node.address
+        if self._port is None or address is None:
+            return None
+        can_id = make_id(_ACM_PRIORITY, Pgn.PROPRIETARY_A, address, user.address)
+        return Frame(can_id, user.control_data(self._clock.now_s()))
 
     def _send(self, frame: Frame) -> bool:
         if self._port is None:
@@ -313,16 +320,18 @@ class CanLink:
 
     async def _schedule(self) -> None:
         """Every 20 ms protocol timers, every 100 ms on the same grid control messages; no catching up."""
-        ticker = Ticker(_POLL_S, kernel=isinstance(self._clock, SystemClock))
+        ticker = Ticker(_POLL_S, kernel=isinstance(self._clock, SystemClock), ahead_s=_AHEAD_S)
         per_acm_n = round(ACM_PERIOD_S / _POLL_S)
         tick_n, sent_for_n = 0, -1
         try:
             while True:
                 if tick_n // per_acm_n != sent_for_n and self._port is not None:
                     sent_for_n = tick_n // per_acm_n
+                    frames = [frame for user in self._users.values() if (frame := self._control(user)) is not None]
+                    ticker.meet()
                     self.counters.acm_late_max_s = max(self.counters.acm_late_max_s, ticker.late_s)
-                    for user in tuple(self._users.values()):
-                        self.send_control(user)
+                    for frame in frames:
+                        self._send(frame)
                 self._node.poll(self._clock.now_s())
                 self._flush()
                 tick_n += await ticker.wait()

@@ -173,3 +173,17 @@ async def test_the_grid_is_kept_and_missed_points_are_counted(kernel: bool) -> N
     assert ticks_n * 0.01 <= loop.time() - start_s + 0.011
     ticker.close()
     ticker.close()
+
+
+async def test_woken_ahead_of_the_grid_a_task_can_meet_its_point() -> None:
+    loop = asyncio.get_running_loop()
+    start_s = loop.time()
+    ticker, ahead_n, ticks_n = Ticker(0.02, kernel=True, ahead_s=0.01), 0, 0
+    for _ in range(20):
+        ticks_n += await ticker.wait()
+        ahead_n += loop.time() < start_s + ticks_n * 0.02
+        ticker.meet()
+        assert loop.time() >= start_s + ticks_n * 0.02
+        assert ticker.late_s == pytest.approx(loop.time() - start_s - ticks_n * 0.02, abs=0.02)
+    assert ahead_n > 0
+    ticker.close()
