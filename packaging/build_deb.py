@@ -53,6 +53,7 @@ FILES = (
     ("systemd/network/80-graderd-can.network", "usr/share/graderd/network/80-graderd-can.network", 0o644),
     ("systemd/dropins/realtime.conf", "usr/share/graderd/dropins/realtime.conf", 0o644),
     ("systemd/dropins/web-page.conf", "usr/share/graderd/dropins/web-page.conf", 0o644),
+    ("systemd/dropins/gpio.conf", "usr/share/graderd/dropins/gpio.conf", 0o644),
     ("systemd/dropins/bind-devices.conf", "usr/share/graderd/dropins/bind-devices.conf", 0o644),
     ("LICENSE", "usr/share/doc/graderd/copyright", 0o644),
 )

@@ -1,7 +1,8 @@
-"""Stop inputs: the modem lines of a serial port, and the rig's."""
+"""Stop inputs: the modem lines of a serial port, two lines of a GPIO chip, and the rig's."""
 
 from __future__ import annotations
 
+from drivers.stop_input.gpio import GpioStopInput
 from drivers.stop_input.serial_line import SerialStopInput
 from drivers.stop_input.simulated import SimulatedStopInput, StopLoop
 from graderd.hal.settings import StopInputSettings
@@ -13,10 +14,12 @@ def make_stop_input(settings: StopInputSettings) -> StopInput | None:
     match settings.backend:
         case "serial":
             return SerialStopInput(settings)
+        case "gpio":
+            return GpioStopInput(settings)
         case "simulated":
             return SimulatedStopInput(settings.port)
         case "none":
             return None
 
 
-__all__ = ["SerialStopInput", "SimulatedStopInput", "StopLoop", "make_stop_input"]
+__all__ = ["GpioStopInput", "SerialStopInput", "SimulatedStopInput", "StopLoop", "make_stop_input"]

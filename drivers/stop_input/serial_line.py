@@ -1,7 +1,7 @@
-"""A loop of wire on a serial port's modem lines: an output (RTS or DTR) drives it, an input (CTS, DSR or CD) reads it.
+"""The stop loop on a serial port's modem lines: an output (RTS or DTR) drives it, an input (CTS, DSR or CD) reads it.
 
 Any USB serial adapter with these lines will do (RS-232 or TTL). Lines and ioctls: tty_ioctl(4), TIOCMGET and TIOCMSET,
-through pyserial. The loop starts at the output, goes through the normally closed contacts and ends at the input.
+through pyserial.
 """
 
 from __future__ import annotations
@@ -12,12 +12,8 @@ from typing import Protocol
 
 import serial
 
-from graderd.hal.errors import DeviceLostError, DeviceMissingError
+from drivers.stop_input.loop import LoopStopInput
 from graderd.hal.settings import StopInputSettings
-
-FOLLOW_S = 0.03
-"""USB adapters tell a changed line after some 1 to 16 ms."""
-_LOOK_EVERY_S = 0.001
 
 
 class ModemPort(Protocol):
@@ -51,7 +47,24 @@ def _open_port(port: str) -> ModemPort:
     return opened
 
 
-class SerialStopInput:
+class _ModemWire:
+    """Two modem lines of an open port."""
+
+    def __init__(self, port: ModemPort, settings: StopInputSettings) -> None:
+        self._port = port
+        self._settings = settings
+
+    def drive(self, on: bool) -> None:
+        setattr(self._port, self._settings.drive, on)
+
+    def reads(self) -> bool:
+        return bool(getattr(self._port, self._settings.line))
+
+    def close(self) -> None:
+        self._port.close()
+
+
+class SerialStopInput(LoopStopInput):
     """See the module's text. ``open_port`` and ``sleep`` are for tests."""
 
     def __init__(
@@ -60,71 +73,9 @@ class SerialStopInput:
         open_port: Callable[[str], ModemPort] = _open_port,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._settings = settings
-        self._open_port = open_port
-        self._sleep = sleep
-        self._port: ModemPort | None = None
-
-    @property
-    def where(self) -> str:
-        """Port and line, for people."""
-        return f"{self._settings.port} {self._settings.line.upper()}"
-
-    def open(self) -> None:
-        """See the contract."""
-        self.close()
-        try:
-            self._port = self._open_port(self._settings.port)
-            self._drive(self._port, True)
-            self._read(self._port)
-        except (OSError, ValueError) as error:  # serial.SerialException is an OSError
-            self.close()
-            raise DeviceMissingError(
-                self.where, f"cannot be used as stop input ({error})", "Check its cable and stop_input.port"
-            ) from error
-
-    def is_closed(self) -> bool:
-        """See the contract."""
-        return self._guarded(self._read)
-
-    def follows(self) -> bool:
-        """See the contract."""
-        return self._guarded(self._pulse)
-
-    def close(self) -> None:
-        """See the contract."""
-        port, self._port = self._port, None
-        if port is not None:
-            port.close()
-
-    def _guarded(self, ask: Callable[[ModemPort], bool]) -> bool:
-        if self._port is None:
-            raise DeviceLostError(self.where, "is not open")
-        try:
-            return ask(self._port)
-        except OSError as error:
-            self.close()
-            raise DeviceLostError(self.where, f"is gone ({error})", "Plug the adapter in again") from error
-
-    def _read(self, port: ModemPort) -> bool:
-        return bool(getattr(port, self._settings.line))
-
-    def _drive(self, port: ModemPort, on: bool) -> None:
-        setattr(port, self._settings.drive, on)
-
-    def _pulse(self, port: ModemPort) -> bool:
-        try:
-            self._drive(port, False)
-            opened = self._becomes(port, False)
-        finally:
-            self._drive(port, True)
-        # Back before the next look at the loop, or the pulse itself would be taken for a press.
-        self._becomes(port, True)
-        return opened
-
-    def _becomes(self, port: ModemPort, wanted: bool) -> bool:
-        for _ in range(round(FOLLOW_S / _LOOK_EVERY_S)):
-            if self._read(port) is wanted:
-                return True
-            self._sleep(_LOOK_EVERY_S)
-        return False
+        super().__init__(
+            f"{settings.port} {settings.line.upper()}",
+            "stop_input.port",
+            lambda: _ModemWire(open_port(settings.port), settings),
+            sleep,
+        )

@@ -109,10 +109,15 @@ class ActuatorSettings(Settings):
 class StopInputSettings(Settings):
     """A normally closed loop whose opening stops the machine: buttons, gate switches, a contact of the safety relay."""
 
-    backend: Literal["none", "serial", "simulated"] = Field("none", description="serial: modem lines of a serial port")
-    port: str = Field("", description="serial port, or the simulated loop's socket")
-    drive: Literal["rts", "dtr"] = Field("rts", description="output that drives the loop")
-    line: Literal["cts", "dsr", "cd"] = Field("cts", description="input at the loop's end")
+    backend: Literal["none", "serial", "gpio", "simulated"] = Field(
+        "none", description="serial: modem lines of a serial port; gpio: two lines of a GPIO chip"
+    )
+    port: str = Field("", description="serial port, GPIO chip (/dev/gpiochip0), or the simulated loop's socket")
+    drive: Literal["rts", "dtr"] = Field("rts", description="serial: output that drives the loop")
+    line: Literal["cts", "dsr", "cd"] = Field("cts", description="serial: input at the loop's end")
+    gpio_drive_n: int = Field(0, ge=0, description="gpio: number of the line that drives the loop")
+    gpio_sense_n: int = Field(1, ge=0, description="gpio: number of the line at the loop's end")
+    gpio_pull_down: bool = Field(True, description="gpio: the chip pulls the input down; false: a resistor does")
     poll_hz: Positive = Field(100.0, ge=10, le=1000, description="looks at the loop a second")
     open_samples_n: int = Field(2, ge=1, le=10, description="open in so many looks in a row: stop")
     stale_s: Positive = Field(0.2, description="no look for so long: stop")
@@ -120,8 +125,10 @@ class StopInputSettings(Settings):
 
     @model_validator(mode="after")
     def _port(self) -> StopInputSettings:
-        if self.backend == "serial" and not self.port:
-            raise ValueError("backend serial needs a port")
+        if self.backend in ("serial", "gpio") and not self.port:
+            raise ValueError(f"backend {self.backend} needs a port")
+        if self.backend == "gpio" and self.gpio_drive_n == self.gpio_sense_n:
+            raise ValueError("gpio_drive_n and gpio_sense_n must be two lines")
         return self
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 import threading
 import time
 from collections.abc import AsyncIterator, Callable
@@ -11,10 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gpiod
 import pytest
 from pydantic import ValidationError
 
-from drivers.stop_input import SerialStopInput, SimulatedStopInput, StopLoop, make_stop_input
+from drivers.stop_input import GpioStopInput, SerialStopInput, SimulatedStopInput, StopLoop, make_stop_input
 from graderd.config import Config
 from graderd.core.fault_catalogue import CATALOGUE
 from graderd.core.faults import Clear, Reaction
@@ -129,11 +131,113 @@ def test_a_port_that_is_not_there_or_has_no_lines_is_missing(tmp_path: Path) -> 
         os.close(slave)
 
 
+class FakeGpio:
+    """The kernel's side of ``gpiod.request_lines``: a chip with a loop from line 17 to line 27."""
+
+    def __init__(self) -> None:
+        self.asked: dict[int, gpiod.LineSettings] = {}
+        self.driven = self.pressed = self.shorted = self.gone = False
+        self.releases_n = 0
+
+    def request_lines(self, path: str, consumer: str, config: dict[int, gpiod.LineSettings]) -> FakeGpio:
+        if self.gone:
+            raise FileNotFoundError(2, "No such file or directory", path)
+        assert consumer == "graderd stop input"
+        self.asked = config
+        self.driven = config[17].output_value is gpiod.line.Value.ACTIVE
+        return self
+
+    def set_value(self, line: int, value: gpiod.line.Value) -> None:
+        assert line == 17
+        self.driven = value is gpiod.line.Value.ACTIVE
+
+    def get_value(self, line: int) -> gpiod.line.Value:
+        if self.gone:
+            raise OSError(19, "No such device")
+        assert line == 27
+        closed = self.shorted or (self.driven and not self.pressed)
+        return gpiod.line.Value.ACTIVE if closed else gpiod.line.Value.INACTIVE
+
+    def release(self) -> None:
+        self.releases_n += 1
+
+
+@pytest.fixture
+def gpio(monkeypatch: pytest.MonkeyPatch) -> FakeGpio:
+    chip = FakeGpio()
+    monkeypatch.setattr(gpiod, "request_lines", chip.request_lines)
+    return chip
+
+
+def gpio_input(**settings: Any) -> GpioStopInput:
+    lines = {"gpio_drive_n": 17, "gpio_sense_n": 27}
+    asked = StopInputSettings.model_validate({"backend": "gpio", "port": "/dev/gpiochip9", **lines, **settings})
+    return GpioStopInput(asked, sleep=lambda _: None)
+
+
+def test_the_gpio_loop_is_driven_pulled_down_and_read(gpio: FakeGpio) -> None:
+    source = gpio_input()
+    source.open()
+    assert gpio.asked[17].direction is gpiod.line.Direction.OUTPUT
+    assert gpio.asked[27].direction is gpiod.line.Direction.INPUT
+    assert gpio.asked[27].bias is gpiod.line.Bias.PULL_DOWN
+    assert source.is_closed()
+    gpio.pressed = True
+    assert not source.is_closed()
+    gpio.pressed = False
+    assert source.follows()
+    assert gpio.driven
+    gpio.shorted = True
+    assert source.is_closed()
+    assert not source.follows()
+    assert gpio.driven
+    source.close()
+    source.close()
+    assert gpio.releases_n == 1
+
+
+def test_a_resistor_may_pull_the_gpio_line_down(gpio: FakeGpio) -> None:
+    gpio_input(gpio_pull_down=False).open()
+    assert gpio.asked[27].bias is gpiod.line.Bias.AS_IS
+
+
+def test_a_gpio_chip_that_goes_is_lost_and_let_go(gpio: FakeGpio) -> None:
+    source = gpio_input()
+    source.open()
+    gpio.gone = True
+    with pytest.raises(DeviceLostError, match="is gone"):
+        source.is_closed()
+    assert gpio.releases_n == 1
+    with pytest.raises(DeviceMissingError, match="gpio_drive_n"):
+        source.open()
+
+
+def test_a_gpio_chip_that_is_not_there_is_missing(tmp_path: Path) -> None:
+    """Through the real library: no such file, and a file that is no chip."""
+    no_chip = tmp_path / "file"
+    no_chip.write_text("", encoding="utf-8")
+    for path in (tmp_path / "none", no_chip, Path("/dev/null")):
+        source = make_stop_input(StopInputSettings(backend="gpio", port=str(path)))
+        assert isinstance(source, GpioStopInput)
+        with pytest.raises(DeviceMissingError, match="cannot be used as stop input"):
+            source.open()
+
+
+def test_without_its_package_the_gpio_backend_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gpiod", None)
+    with pytest.raises(DeviceMissingError, match=r"graderd\[gpio\]"):
+        gpio_input().open()
+
+
 def test_settings() -> None:
     assert make_stop_input(StopInputSettings()) is None
     assert Config().stop_input.backend == "none"
     with pytest.raises(ValidationError, match="needs a port"):
         StopInputSettings(backend="serial")
+    with pytest.raises(ValidationError, match="needs a port"):
+        StopInputSettings(backend="gpio")
+    with pytest.raises(ValidationError, match="two lines"):
+        StopInputSettings(backend="gpio", port="/dev/gpiochip0", gpio_drive_n=4, gpio_sense_n=4)
     assert isinstance(make_stop_input(StopInputSettings(backend="simulated", port="x")), SimulatedStopInput)
 
 
