@@ -10,7 +10,7 @@ HIL_ARGS ?=
 BENCH_ARGS ?=
 SOAK_S ?= 900
 
-.PHONY: help run test faults deb hil soak hil-package bench-hw check format lock clean
+.PHONY: help run test faults deb hil soak hil-package hil-usb bench-hw check format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -49,6 +49,11 @@ soak: $(STAMP) ## the soak alone, SOAK_S seconds of it
 hil-package: $(STAMP) ## install, use, upgrade, purge the package in a clean Debian root (not in every CI run)
 	@hil/setup --usb
 	@PYTHONPATH=. $(BIN)/python -m hil.package $(HIL_ARGS)
+
+hil-usb: $(STAMP) ## QEMU: an FTDI adapter pulled and plugged, two SJA1000 controllers (before a release; 5 minutes or so)
+	@hil/setup --usb
+	@$(MAKE) --no-print-directory deb
+	@PYTHONPATH=. $(BIN)/python -m hil.usb $(HIL_ARGS)
 
 bench-hw: $(STAMP) ## tests against real hardware; asks before each motion (needs GRADERD_BENCH=1 and a terminal)
 	@PYTHONPATH=. $(BIN)/python -m hil.bench $(BENCH_ARGS)

@@ -193,17 +193,17 @@ def couple(one: str, other: str) -> None:
         subprocess.run(["cangw", "-A", "-s", source, "-d", destination, "-e"], check=True)
 
 
-@contextlib.contextmanager
-def vcan(name: str) -> Iterator[str]:
-    """A virtual CAN interface, up, for as long as the block lasts."""
+def add_vcan(name: str) -> None:
+    """Make a virtual CAN interface, or take the one of that name, and set it up."""
     if not interface_exists(name):
         ip("link", "add", "dev", name, "type", "vcan")
     ip("link", "set", name, "txqueuelen", "1000", "up")
-    try:
-        yield name
-    finally:
-        if interface_exists(name):
-            # Linux before 6.1.192 waits here for as long as somebody has a J1939 socket open on it.
-            remove = subprocess.Popen(["ip", "link", "del", name])
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                remove.wait(5.0)
+
+
+def remove_vcan(name: str) -> None:
+    """Take a virtual CAN interface away; none is fine."""
+    if interface_exists(name):
+        # Linux before 6.1.192 waits here for as long as somebody has a J1939 socket open on it, and cannot be killed.
+        remove = subprocess.Popen(["ip", "link", "del", name])
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            remove.wait(5.0)

@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from hil import uml
@@ -22,13 +23,13 @@ BASE = ("systemd", "systemd-sysv", "udev", "dbus", "kmod", "iproute2", "ca-certi
 NEWER = "99.0.0"
 
 
-def clean_root(directory: Path, suite: str, mirror: str) -> None:
-    """A bare root in ``directory``.
+def clean_root(directory: Path, suite: str, mirror: str, include: Sequence[str] = BASE) -> None:
+    """A bare root in ``directory`` with a few packages.
 
     Raises:
         SystemExit: mmdebstrap is not there or failed.
     """
-    command = ["mmdebstrap", "--quiet", "--variant=minbase", "--mode=root", f"--include={','.join(BASE)}"]
+    command = ["mmdebstrap", "--quiet", "--variant=minbase", "--mode=root", f"--include={','.join(include)}"]
     if subprocess.run([*command, suite, str(directory), *([mirror] if mirror else [])], check=False).returncode:
         raise SystemExit("hil: no clean root: mmdebstrap failed")
 

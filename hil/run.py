@@ -32,6 +32,7 @@ class Part:
     name: str
     suite: str
     timeout_s: float
+    place_n: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +77,9 @@ def in_guest(part: Part, package: Path, *, follow: bool) -> int:
     command = (str(PYTHON), "-m", "hil.suite", part.suite, str(package))
     out = RESULTS / part.name
     shutil.rmtree(out, ignore_errors=True)
-    status = uml.Guest(command, out, directory=PROJECT, timeout_s=part.timeout_s).run(follow=follow)
+    status = uml.Guest(command, out, directory=PROJECT, timeout_s=part.timeout_s, place_n=part.place_n).run(
+        follow=follow
+    )
     if status in (uml.TIMED_OUT, uml.GUEST_DIED):
         sys.stderr.write(
             f"hil: {part.name}: {'timed out' if status == uml.TIMED_OUT else 'the guest died'}; see {out}\n"
@@ -96,8 +99,8 @@ def judge_shutdown() -> int:
 
 def in_guests(package: Path, part: str, soak_s: float) -> list[int]:
     """Suite and soak in two guests side by side; the soak's log is printed after the suite's."""
-    suite = Part("suite", "all-and-shutdown", 900.0)
-    soak = Part("soak", "soak", soak_s + 420.0)
+    suite = Part("suite", "all-and-shutdown", 900.0, 0)
+    soak = Part("soak", "soak", soak_s + 420.0, 1)
     with ThreadPoolExecutor(max_workers=2, thread_name_prefix="guest") as pool:
         beside = pool.submit(in_guest, soak, package, follow=part == "soak") if part != "suite" else None
         results = [in_guest(suite, package, follow=True), judge_shutdown()] if part != "soak" else []

@@ -53,6 +53,8 @@ class Guest:
     kernel: Path = KERNEL
     root: Path = Path("/")
     kernel_args: tuple[str, ...] = ()
+    place_n: int | None = 0
+    """Which of the host's processors it gets, counted from 0 and round again; None: whichever is free."""
 
     def run(self, *, follow: bool = True) -> int:
         """Boot, run, power off; print the command's output while it comes. Returns the exit status described above."""
@@ -62,9 +64,10 @@ class Guest:
         (self.out / "log").touch()
         (self.out / "guest-command").write_text(self._script(), encoding="utf-8")
         with tempfile.TemporaryDirectory(prefix="graderd-hil-") as scratch, contextlib.ExitStack() as stack:
-            initramfs = build_initramfs(Path(scratch))
+            command = self.command_line(Path(scratch))
             console = stack.enter_context((self.out / "console").open("wb"))
-            process = stack.enter_context(_guest_process(self._command_line(initramfs), console.fileno(), scratch))
+            stack.enter_context(_on_one_processor(self.place_n))
+            process = stack.enter_context(_guest_process(command, console.fileno(), scratch))
             done = Event()
             follower = Thread(target=_follow, args=(self.out / "log", done), name="guest log")
             if follow:
@@ -99,11 +102,13 @@ class Guest:
             "systemctl poweroff --force\n"
         )
 
-    def _command_line(self, initramfs: Path) -> list[str]:
+    def command_line(self, scratch: Path) -> list[str]:
+        """What starts the guest; files it needs are made in ``scratch``."""
+        overlay = next(MODULES.glob("*/kernel/fs/overlayfs/overlay.ko"))
         return [
             str(self.kernel),
             f"mem={self.memory_mib}M",
-            f"initrd={initramfs}",
+            f"initrd={build_initramfs(scratch, [overlay])}",
             "con=null",
             "ssl=null",
             "con0=null,fd:1",
@@ -132,14 +137,16 @@ def missing() -> list[str]:
     return absent
 
 
-def build_initramfs(directory: Path) -> Path:
-    """Pack busybox, the overlay module and our ``init`` into ``directory/initramfs`` (about 1.3 MB)."""
-    root = directory / "root"
+def build_initramfs(directory: Path, modules: Sequence[Path]) -> Path:
+    """Pack busybox, kernel modules to be loaded in that order and our ``init`` into ``directory/initramfs``."""
+    root = directory / "initramfs.d"
     (root / "bin").mkdir(parents=True)
+    (root / "modules").mkdir()
     shutil.copy(BUSYBOX, root / "bin" / "busybox")
     shutil.copy(INIT, root / "init")
     (root / "init").chmod(0o755)
-    shutil.copy(next(MODULES.glob("*/kernel/fs/overlayfs/overlay.ko")), root / "overlay.ko")
+    for number, module in enumerate(modules):
+        shutil.copy(module, root / "modules" / f"{number:02}-{module.name}")
     names = "\n".join(str(path.relative_to(root)) for path in sorted(root.rglob("*")))
     archive = directory / "initramfs"
     with archive.open("wb") as target:
@@ -147,6 +154,22 @@ def build_initramfs(directory: Path) -> Path:
             ["cpio", "--create", "--format=newc", "--quiet"], cwd=root, input=names.encode(), stdout=target, check=True
         )
     return archive
+
+
+@contextlib.contextmanager
+def _on_one_processor(place_n: int | None) -> Iterator[None]:
+    """What this thread starts runs on one processor.
+
+    Each system call in a user-mode guest is a change between two processes of the host. On two processors each of them
+    wakes the other across; on one a boot took 5.6 s instead of 8.6 to 11.3 on a busy host.
+    """
+    allowed = os.sched_getaffinity(0)
+    if place_n is not None:
+        os.sched_setaffinity(0, {sorted(allowed)[place_n % len(allowed)]})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, allowed)
 
 
 @contextlib.contextmanager

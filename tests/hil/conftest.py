@@ -15,7 +15,6 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -48,6 +47,8 @@ FOR_THE_GUEST: dict[str, object] = {
     "camera.stale_s": 3.0,
     "camera.restart_s": 10.0,
     "machine.lease_s": 1.0,
+    "perception.decision.max_frame_age_s": 0.5,
+    "perception.decision.max_angle_age_s": 0.5,
     "rule.vote_max_age_s": 4.0,
 }
 
@@ -81,13 +82,13 @@ def pytest_report_header() -> list[str]:
 def wire(request: pytest.FixtureRequest) -> Iterator[str]:
     """The bus: the rig's end and the service's end, coupled."""
     bus.load_modules()
-    with ExitStack() as stack:
-        for name in (WIRE, CAN):
-            stack.enter_context(bus.vcan(name))
-        bus.couple(CAN, WIRE)
-        yield WIRE
-        if _left_turning(request):
-            stack.pop_all()
+    for name in (WIRE, CAN):
+        bus.add_vcan(name)
+    bus.couple(CAN, WIRE)
+    yield WIRE
+    if not _left_turning(request):
+        for name in (CAN, WIRE):
+            bus.remove_vcan(name)
 
 
 @pytest.fixture(scope="session")

@@ -26,6 +26,7 @@ def test_shutdown_while_turning(request: pytest.FixtureRequest, ready: Grader, r
         "--unit=hil-witness.service",
         # Begun before the service, so it sees the end of it.
         "--property=Before=graderd.service hil-rig.service",
+        f"--property=RequiresMountsFor={OUT}",
         f"--property=WorkingDirectory={Path.cwd()}",
         *(sys.executable, "-m", "hil.shutdown", "watch", "wire0", str(OUT / "shutdown.log")),
     )
