@@ -1,10 +1,12 @@
-"""``python -m drivers.electrak.dump``: the bus in words, live or from a log, one line or one JSON object a frame."""
+"""``python -m drivers.electrak.dump``: the bus in words, live or from a log, one line or one JSON object a frame.
+
+A serial adapter has one reader: while the daemon has it, the frames come from the daemon (``graderd can dump``).
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
-import re
 import select
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -14,6 +16,7 @@ from typing import Any, Final, TextIO
 import can
 
 from drivers.electrak.bus_events import BusEvent
+from drivers.electrak.candump import Timed, parse_candump
 from drivers.electrak.decode import DecodedFrame, FrameDecoder
 from drivers.electrak.j1939.ids import Frame
 from drivers.electrak.ports import PortLostError, open_port
@@ -29,18 +32,6 @@ _READERS: Final[dict[str, tuple[Callable[[Any], Iterable[can.Message]], str]]] =
     ".csv": (can.CSVReader, "r"),
 }
 """Log formats read by python-can, by file name; every other file is taken for candump text."""
-
-# candump -l / -L:  (1622749162.123456) can0 18EF1300#DC05191500000000
-_COMPACT: Final = re.compile(
-    r"^\s*(?:\((?P<t>\d+(?:\.\d+)?)\)\s+)?\S+\s+(?P<id>[0-9A-Fa-f]{3,8})#(?P<data>[0-9A-Fa-f]*)"
-)
-# candump, also with -t and -x:  (0.105000)  can0  TX - -  18EF1300   [8]  DC 05 19 15 00 00 00 00
-_COLUMNS: Final = re.compile(
-    r"^\s*(?:\((?P<t>[^)]*)\)\s+)?\S+\s+(?:[RT]X\s+\S+\s+\S+\s+)?(?P<id>[0-9A-Fa-f]{3,8})\s+\[(?P<n>\d)\]\s*"
-    r"(?P<data>(?:[0-9A-Fa-f]{2}\s?)*)"
-)
-
-Timed = tuple[float, Frame]
 
 
 def read_file(path: Path) -> Iterator[Timed]:
@@ -66,30 +57,12 @@ def read_file(path: Path) -> Iterator[Timed]:
         ) from error
 
 
-def parse_candump_line(line: str) -> Timed | None:
-    """One line of candump text (any of its formats), or None where it is no data frame."""
-    match = _COMPACT.match(line) or _COLUMNS.match(line)
-    if match is None:
-        return None
-    digits = match["id"]
-    data = re.sub(r"\s", "", match["data"])
-    if len(data) % 2 or len(data) > 16:
-        return None
-    try:
-        t_s = float(match["t"] or 0.0)
-    except ValueError:  # candump -tA writes a date
-        t_s = 0.0
-    return t_s, Frame(int(digits, 16) & 0x1FFFFFFF, bytes.fromhex(data), len(digits) > 3)
-
-
 def _read_candump(path: Path) -> Iterator[Timed]:
     found = False
     with path.open(encoding="ascii", errors="replace") as lines:
-        for line in lines:
-            timed = parse_candump_line(line)
-            if timed is not None:
-                found = True
-                yield timed
+        for timed in parse_candump(lines):
+            found = True
+            yield timed
     if not found:
         formats = "candump text, or .asc, .blf, .mf4"
         raise ProtocolError(str(path), "holds no CAN frame in candump's form", f"Known formats: {formats}")
@@ -142,9 +115,11 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m drivers.electrak.dump",
         description="Print a CAN bus decoded, live or from a candump, ASC, BLF or MF4 file.",
-        epilog="examples: dump can0 | dump /dev/graderd/can | dump trip.log --json | dump trip.blf",
+        epilog="examples: dump can0 | dump /dev/graderd/can | dump trip.log --json | candump -L can0 | dump -",
     )
-    parser.add_argument("source", nargs="?", default="can0", help="CAN interface, slcan port, or log file")
+    parser.add_argument(
+        "source", nargs="?", default="can0", help="CAN interface, slcan port, log file, or - for candump text"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object a frame")
     arguments = parser.parse_args(argv)
     path = Path(arguments.source)
@@ -152,7 +127,11 @@ def main(argv: list[str] | None = None) -> int:
         is_file = path.is_file()
         if not is_file and path.suffix and not path.exists():
             raise ProtocolError(str(path), "no such file")
-        dump(read_file(path) if is_file else read_live(arguments.source), sys.stdout, as_json=arguments.json)
+        if arguments.source == "-":
+            frames = parse_candump(sys.stdin)
+        else:
+            frames = read_file(path) if is_file else read_live(arguments.source)
+        dump(frames, sys.stdout, as_json=arguments.json)
     except (BrokenPipeError, KeyboardInterrupt):
         sys.stderr.close()  # the reader is gone, and Python would complain about it at exit
     except (DeviceError, OSError) as error:

@@ -213,7 +213,7 @@ class CanLink:
             del self._users[user.address]
 
     def tap(self, listener: Callable[[Frame, float], None]) -> Callable[[], None]:
-        """Call ``listener`` with every frame received (recorder, dump); returns the call that ends it."""
+        """Call ``listener`` with every frame received or sent; returns the call that ends it."""
         self._taps.frames.append(listener)
         return lambda: self._taps.frames.remove(listener)
 
@@ -260,6 +260,10 @@ class CanLink:
             self._on_lost(error)
             return False
         self.counters.tx_n += 1
+        if self._taps.frames:
+            now_s = self._clock.now_s()
+            for tap in self._taps.frames:
+                tap(frame, now_s)
         return True
 
     def _flush(self) -> None:

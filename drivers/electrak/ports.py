@@ -228,6 +228,8 @@ def open_port(settings: CanSettings) -> BusPort:
         return SlcanPort(QuietSlcanBus(settings.channel, settings.bitrate_n))
     except (can.CanError, OSError, ValueError) as error:
         remedy = "Is the adapter plugged in, and may this user open it (group dialout)?"
+        if getattr(error, "error_code", None) == errno.EBUSY:
+            remedy = "An adapter has one reader; a running graderd shares it: 'graderd can dump' without a port"
         if getattr(error, "errno", None) == errno.EAFNOSUPPORT:
             remedy = "This kernel has no CAN support: modprobe can_raw, or use an slcan adapter (interface = 'slcan')"
         raise DeviceMissingError(where, f"cannot be opened: {error}", remedy) from error

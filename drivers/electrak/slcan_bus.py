@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import errno
+import fcntl
 import os
 import select
 
@@ -16,6 +17,8 @@ from drivers.electrak.bus_events import BusEvent
 class QuietSlcanBus(slcanBus):
     """python-can's slcan bus without its waits: no byte-wise reads, no drain after each write, state lines kept.
 
+    The port is ours alone from before the first byte: a second opener would close the channel and take half the frames.
+
     The kernel's slcan driver knows two lines that python-can ignores: ``s<a|w|p|b>RRRTTT`` (controller state and
     error counters) and ``e<n><codes>`` (errors; ``o`` and ``O`` are overruns).
     """
@@ -24,7 +27,12 @@ class QuietSlcanBus(slcanBus):
         self.events: collections.deque[BusEvent] = collections.deque(maxlen=64)
         self._lines: collections.deque[str] = collections.deque()
         self._unsent = bytearray()
-        super().__init__(channel, bitrate=bitrate, sleep_after_open=0.0, timeout=0)
+        self._lock_fd = _lock(channel.partition("@")[0])
+        try:
+            super().__init__(channel, bitrate=bitrate, sleep_after_open=0.0, timeout=0)
+        except BaseException:
+            self._unlock()
+            raise
 
     def _write(self, string: str) -> None:
         self._unsent += string.encode() + self.LINE_TERMINATOR
@@ -65,6 +73,13 @@ class QuietSlcanBus(slcanBus):
             super().shutdown()
         except (can.CanError, OSError):
             self.serialPortOrig.close()
+        finally:
+            self._unlock()
+
+    def _unlock(self) -> None:
+        if self._lock_fd >= 0:
+            os.close(self._lock_fd)
+            self._lock_fd = -1
 
     def _fill(self) -> None:
         try:
@@ -97,3 +112,23 @@ class QuietSlcanBus(slcanBus):
         }.get(line[1:2])
         if event is not None:
             self.events.append(event)
+
+
+def _lock(port: str) -> int:
+    """A descriptor whose lock on the port (the one that pyserial's exclusive mode takes too) lasts until it is closed.
+
+    Raises:
+        CanInitializationError: no such port, no right to it, or another program has it.
+    """
+    try:
+        fd = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        raise can.CanInitializationError(f"{port}: {error.strerror}", error.errno) from error
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(fd)
+        if error.errno == errno.EWOULDBLOCK:
+            raise can.CanInitializationError("another program has it open", errno.EBUSY) from error
+        raise can.CanInitializationError(f"{port}: {error.strerror}", error.errno) from error
+    return fd

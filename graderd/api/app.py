@@ -28,7 +28,8 @@ every field's name, or stands in the field `unit` beside it.
 Anything that is refused is answered with the same three fields: `error` (why), `where` (which command, field or
 header) and `remedy` (what to do).
 
-Two paths are WebSockets: `/v1/stream` and `/v1/jog`. Messages are JSON texts.
+Three paths are WebSockets: `/v1/stream`, `/v1/jog` and `/v1/can`. Messages are JSON texts, those of `/v1/can` candump
+lines.
 """
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncGenerator
 from typing import Any, Protocol
 
 from graderd.core.commands import Command, Reply
@@ -42,6 +43,10 @@ class DaemonPort(Protocol):
         Raises:
             ServiceError: there is none.
         """
+        ...
+
+    def bus_text(self) -> AsyncGenerator[str, None]:
+        """The CAN bus from now on as candump text, some lines at a time; ends when it is closed."""
         ...
 
     async def service(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The two WebSockets: the status stream, and the jog whose lease ends with its connection."""
+"""The WebSockets: the status stream, the CAN bus, and the jog whose lease ends with its connection."""
 
 from __future__ import annotations
 
@@ -47,6 +47,11 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
         finally:
             await session.release()
 
+    @router.websocket("/can")
+    async def can(socket: WebSocket) -> None:
+        await socket.accept()
+        await _until_closed(socket, _send_bus(socket, port), closing)
+
     @router.get("/stream", tags=["status"], summary="WebSocket: status as it changes", responses=UPGRADE_ONLY)
     async def stream_needs_upgrade(
         rate_hz: Annotated[float, Query(gt=0, le=1000)] = limits.stream_max_hz,  # noqa: ARG001  (for the description)
@@ -63,6 +68,12 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
         each a `Reply` or a `Problem`, in order. The lease belongs to the connection: it is given back when the
         connection ends for whatever reason, and lapses by itself 0.3 s after the last `renew`."""
         raise _upgrade_needed("jog")
+
+    @router.get("/can", tags=["status"], summary="WebSocket: the CAN bus as it is", responses=UPGRADE_ONLY)
+    async def can_needs_upgrade() -> str:
+        """Every frame the daemon receives or sends, as candump text, some lines a message. Times are the daemon's
+        monotonic clock. A slow client loses frames and is told how many in a line that begins with `#`."""
+        raise _upgrade_needed("can")
 
     return router
 
@@ -122,6 +133,12 @@ async def _send_status(socket: WebSocket, port: DaemonPort, texts: StatusTexts, 
         after_s = status.time_s
         due_s = max(due_s + 1.0 / rate_hz, loop.time())
         await asyncio.sleep(max(0.0, due_s - loop.time()))
+
+
+async def _send_bus(socket: WebSocket, port: DaemonPort) -> None:
+    async with contextlib.aclosing(port.bus_text()) as texts:
+        async for text in texts:
+            await socket.send_text(text)
 
 
 async def _until_closed(socket: WebSocket, work: Coroutine[Any, Any, None], closing: Closing) -> None:

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
 import typer
 
+from graderd.cli.client import Daemon, daemon_of
+from graderd.cli.console import CliError, ExitCode
 from graderd.cli.epilog import example
 from graderd.cli.passthrough import TAKES_ANYTHING, hand_over
+
+_MODULE = "drivers.electrak.dump"
 
 
 def register(app: typer.Typer) -> None:
@@ -16,6 +25,7 @@ def register(app: typer.Typer) -> None:
     @can.command(
         context_settings=TAKES_ANYTHING,
         epilog=example(
+            "graderd can dump            (the running daemon's bus)",
             "graderd can dump can0",
             "graderd can dump candump.log --json",
             "graderd can dump -- --help     (all its options)",
@@ -24,6 +34,46 @@ def register(app: typer.Typer) -> None:
     def dump(context: typer.Context) -> None:
         """Print the bus decoded, live or from a log file.
 
+        Without a source, or with the serial port that the running daemon has open, the frames come through the daemon.
         Log files are candump, ASC, BLF or MF4. With --json one object a frame.
         """
-        hand_over("drivers.electrak.dump", context.args)
+        arguments = [argument for argument in context.args if argument != "--"]
+        sources = [argument for argument in arguments if not argument.startswith("-")]
+        asks_for_help = bool({"-h", "--help"} & set(arguments))
+        if not asks_for_help and is_the_daemons(daemon := daemon_of(context), sources):
+            through(daemon, [argument for argument in arguments if argument not in sources])
+        else:
+            hand_over(_MODULE, arguments)
+
+
+def is_the_daemons(daemon: Daemon, sources: list[str]) -> bool:
+    """Whether the bus that is asked for is one that only the running daemon can read."""
+    if sources and not Path(sources[0]).is_char_device():
+        return False
+    try:
+        bus: dict[str, Any] = daemon.get("/v1/config")["can"]
+    except CliError as error:
+        if error.exit_code is not ExitCode.NO_DAEMON:
+            raise
+        return False
+    return not sources or (bus["interface"] == "slcan" and Path(bus["channel"]).resolve() == Path(sources[0]).resolve())
+
+
+def through(daemon: Daemon, options: list[str]) -> None:
+    """Decode what the daemon hears and sends, until the daemon, the decoder's reader or the user ends it."""
+    command = [sys.executable, "-m", _MODULE, "-", *options]
+    with (
+        daemon.websocket("/v1/can") as stream,
+        subprocess.Popen(command, stdin=subprocess.PIPE, bufsize=0) as decoder,
+    ):
+        assert decoder.stdin is not None
+        try:
+            while decoder.poll() is None:
+                text = str(stream.recv())
+                if text.startswith("#"):
+                    typer.echo(text.partition("\n")[0], err=True)
+                decoder.stdin.write(text.encode())
+        except (BrokenPipeError, KeyboardInterrupt):
+            return  # nobody reads on: that is how a live view ends
+        finally:
+            decoder.terminate()

@@ -37,6 +37,11 @@ def _publish_nowhere(faults: tuple[DeviceFault, ...], stopped: bool) -> None:
     """Where there is no bus to tell."""
 
 
+def _watch_nothing(listener: Callable[[str], None]) -> Callable[[], None]:  # noqa: ARG001
+    """Where there is no bus to watch."""
+    return lambda: None
+
+
 @dataclass(frozen=True, slots=True)
 class Devices:
     """Everything that can move, and the bus under it."""
@@ -46,6 +51,9 @@ class Devices:
     actuators: dict[str, LinearActuator]
     publish_faults: Callable[[tuple[DeviceFault, ...], bool], None] = _publish_nowhere
     """Puts the active faults, and whether the machine is stopped, on the bus as diagnostic messages (DM1)."""
+    watch_bus: Callable[[Callable[[str], None]], Callable[[], None]] = _watch_nothing
+    """Calls a listener with every frame on the bus, received or sent, as a line of candump text; returns the call that
+    ends it."""
 
     def all(self) -> dict[str, Rotator | LinearActuator]:
         """The axes by device name."""

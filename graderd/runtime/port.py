@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections import deque
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from typing import Any
 
 from graderd.api.port import ServiceError
@@ -16,6 +17,10 @@ from graderd.runtime.perception import PerceptionWorker
 from graderd.runtime.status import build_status
 
 Service = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
+BUS_LINES_N = 2000
+"""More than a second of a full bus."""
+BUS_PAUSE_S = 0.05
+"""Frames come in bundles: a message for each would cost more than the bus itself."""
 SERVICES_IN_ANY_MODE = frozenset({"rotation.verify_profile"})
 
 
@@ -67,6 +72,30 @@ class Port:
             return await self._eyes.preview_jpeg()
         except TimeoutError:
             raise ServiceError("the camera gives no picture", "see graderd status for its fault") from None
+
+    async def bus_text(self) -> AsyncGenerator[str, None]:
+        """What is on the CAN bus from now on; a reader that is slow loses the oldest lines and is told how many."""
+        lines: deque[str] = deque(maxlen=BUS_LINES_N)
+        arrived, heard_n = asyncio.Event(), 0
+
+        def hear(line: str) -> None:
+            nonlocal heard_n
+            heard_n += 1
+            lines.append(line)
+            arrived.set()
+
+        end = self._loop.devices.watch_bus(hear)
+        try:
+            while True:
+                await arrived.wait()
+                await asyncio.sleep(BUS_PAUSE_S)
+                lost_n, heard_n = heard_n - len(lines), 0
+                text = "".join(f"{line}\n" for line in lines)
+                lines.clear()
+                arrived.clear()
+                yield f"# {lost_n} frames lost: the reader is too slow\n{text}" if lost_n else text
+        finally:
+            end()
 
     async def service(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """Run a device service; those that move or unpower need manual or disarmed mode and consent."""

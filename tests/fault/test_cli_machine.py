@@ -93,6 +93,28 @@ async def test_the_blade_stands_when_the_jogs_process_is_killed(tmp_path: Path) 
         assert state["blade_deg"] < 40.0
 
 
+@pytest.mark.parametrize("named", [False, True])
+async def test_the_bus_of_the_running_daemon_is_dumped_through_it(tmp_path: Path, named: bool) -> None:
+    """Its serial adapter has one reader, and that is the daemon: frames of both directions, and nobody is disturbed."""
+    async with machine(tmp_path) as whole:
+        await whole.until(lambda s: all(s.axes[name].measured is not None for name in ("lift_left", "tilt")))
+        channel = (await whole.client.get("/v1/config")).json()["can"]["channel"]
+        dumping = await start(tmp_path, "can", "dump", *([channel] if named else []), "--json")
+        assert dumping.stdout is not None
+        seen: set[tuple[str, int]] = set()
+        async with asyncio.timeout(60):
+            while len(seen) < 6:
+                frame = json.loads(await dumping.stdout.readline())
+                if frame["name"] in ("ACM", "AFM"):
+                    seen.add((frame["name"], frame["destination" if frame["name"] == "ACM" else "source"]))
+        assert seen == {(name, address) for name in ("ACM", "AFM") for address in (19, 20, 27)}
+        dumping.send_signal(signal.SIGINT)
+        async with asyncio.timeout(30):
+            _, err = await dumping.communicate()
+        assert err == b""
+        assert (await whole.status()).axes["tilt"].lifecycle == "standby"
+
+
 async def test_a_wrong_configuration_is_told_and_nothing_starts(tmp_path: Path) -> None:
     config = tmp_path / "wrong.toml"
     config.write_text("[rotation]\nmax_dg = 45.0\n")

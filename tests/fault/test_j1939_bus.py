@@ -14,7 +14,7 @@ from pathlib import Path
 import can
 import pytest
 
-from drivers.electrak import CanLink, ElectrakActuator
+from drivers.electrak import CanLink, ElectrakActuator, dump
 from drivers.electrak.bus_events import BusEvent, event_of
 from drivers.electrak.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
 from drivers.electrak.ports import PortLostError, SocketCanPort, lost_from
@@ -281,6 +281,28 @@ async def test_an_unplugged_adapter_is_noticed_at_once_and_used_again_when_it_is
         bus.replug()
         await until(lambda: state(axis) is Lifecycle.STANDBY)
         assert conditions(link) == set()
+
+
+async def test_a_second_reader_is_refused_before_it_disturbs_the_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async with slcan_machine(tmp_path) as (_, link, axis):
+        assert await asyncio.to_thread(dump.main, [str(tmp_path / "can")]) == 1
+        error = capsys.readouterr().err
+        assert "another program has it open" in error
+        assert "'graderd can dump' without a port" in error
+        before_n = link.counters.rx_n
+        await until(lambda: link.counters.rx_n > before_n + 5)
+        assert conditions(link) == set()
+        assert state(axis) is Lifecycle.STANDBY
+
+
+async def test_what_is_sent_and_what_is_received_can_be_watched(tmp_path: Path) -> None:
+    async with slcan_machine(tmp_path) as (_, link, _):
+        seen: set[int] = set()
+        end = link.tap(lambda frame, _: seen.add(frame.can_id))
+        await until(lambda: seen >= {0x18EF1300 | (link.address or 0), 0x19EFFF13})
+        end()
 
 
 async def test_state_lines_of_the_adapter_are_understood(tmp_path: Path) -> None:

@@ -14,8 +14,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.electrak.candump import candump_line, parse_candump_line
 from drivers.electrak.decode import FrameDecoder
-from drivers.electrak.dump import dump, main, parse_candump_line, read_file, text_of
+from drivers.electrak.dump import dump, main, read_file, text_of
 from drivers.electrak.j1939.dm1 import dtc_of, encode
 from drivers.electrak.j1939.ids import Frame, Pgn, make_id
 from drivers.electrak.j1939.transport import Transport
@@ -200,3 +201,15 @@ def test_the_command_line_writes_json_and_survives_a_closed_pipe(tmp_path: Path)
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert [line["name"] for line in lines] == ["ACM", "AFM"]
     assert done.stderr == ""
+
+
+def test_candump_text_on_standard_input_is_read_and_what_is_written_is_read_again() -> None:
+    text = "# 2 frames lost: the reader is too slow\n" + "".join(f"{candump_line(f, t)}\n" for t, f in FRAMES)
+    done = subprocess.run(
+        [sys.executable, "-m", "drivers.electrak.dump", "-", "--json"],
+        input=text, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    objects = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [(o["t_s"], o["can_id"], o["data"]) for o in objects] == [
+        (t, f.can_id, f.data.hex().upper()) for t, f in FRAMES
+    ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -40,6 +40,7 @@ class FakeDaemon:
     frozen: bool = False
     late_s: list[float] = field(default_factory=list)
     seen: list[cmd.Command] = field(default_factory=list)
+    bus_watched_n: int = 0
     state: State = field(default_factory=State)
     positions: dict[str, float] = field(
         default_factory=lambda: {"rotation": 0.0, "lift_left": 100.0, "lift_right": 100.0, "tilt": 50.0}
@@ -83,6 +84,14 @@ class FakeDaemon:
         if self.picture is None:
             raise ServiceError("no picture yet", "look at the camera's cable")
         return self.picture
+
+    async def bus_text(self) -> AsyncGenerator[str, None]:
+        try:
+            for line in ("(1.000000) can0 18EF1300#DC05191500000000\n", "# 3 frames lost: the reader is too slow\n"):
+                yield line
+            await asyncio.Event().wait()
+        finally:
+            self.bus_watched_n += 1
 
     async def service(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         if name == "rotation.verify_profile":

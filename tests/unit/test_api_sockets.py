@@ -44,6 +44,14 @@ async def test_the_stream_sends_newer_and_newer_statuses_at_the_rate_asked_for(t
             assert took_s >= 7 / rate_hz * 0.95
 
 
+async def test_the_bus_is_sent_as_it_comes_and_let_go_when_the_client_goes(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        async with connect(path, "/v1/can") as socket:
+            assert await within(5, socket.recv()) == "(1.000000) can0 18EF1300#DC05191500000000\n"
+            assert str(await within(5, socket.recv())).startswith("# 3 frames lost")
+        await daemon.until(lambda: daemon.bus_watched_n == 1)
+
+
 async def test_a_slow_client_gets_no_old_statuses_and_makes_nothing_grow(tmp_path: Path) -> None:
     async with serving(tmp_path, limits=ApiLimits(stream_max_hz=1000.0)) as (daemon, path):
         reader, writer = await asyncio.open_unix_connection(str(path), limit=4096)

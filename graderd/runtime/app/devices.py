@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from drivers.dynamixel.ph54 import Ph54Rotator
 from drivers.electrak.actuator import ElectrakActuator
+from drivers.electrak.candump import candump_line
 from drivers.electrak.link import CanLink
 from drivers.stop_input import make_stop_input
 from graderd.config import Config
@@ -27,11 +28,15 @@ def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], Non
     def publish(faults: tuple[DeviceFault, ...], stopped: bool) -> None:
         link.publish_faults(faults, stopped=stopped)
 
+    def watch_bus(listener: Callable[[str], None]) -> Callable[[], None]:
+        return link.tap(lambda frame, now_s: listener(candump_line(frame, now_s)))
+
     return Devices(
         rotation=rotator,
         link=link,
         actuators=actuators,
         publish_faults=publish,
+        watch_bus=watch_bus,
     )
 
 
