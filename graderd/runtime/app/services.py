@@ -109,7 +109,7 @@ async def _step_response(
         "profile velocity": f"{config.rotation.velocity_deg_per_s:g} deg/s",
         "profile acceleration": f"{config.rotation.acceleration_deg_per_s2:g} deg/s²",
         "current limit": f"{config.rotation.current_limit_a:g} A",
-        "simulated": str(config.simulated),
+        "simulated": "yes" if config.simulated else "no",
     }
     recording = analyse(samples, config.rotation.in_position_deg, settings)
     return {
@@ -117,7 +117,7 @@ async def _step_response(
         "backlash_deg": recording.backlash_deg,
         "backlash_from": recording.backlash_from,
         "settings": settings,
-        "report_html": render(recording, when=datetime.now(UTC).isoformat(timespec="seconds")),
+        "report_html": render(recording, when=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
     }
 
 
