@@ -15,6 +15,8 @@ APART_S = 0.02
 """Colour and depth further apart in device time are not of one moment."""
 TORN_SHOWN_N = 30
 """So many torn sets in a row are no accident of playing: they are handed out, and the health check names them."""
+PAUSE_S = 0.05
+"""After so long without a picture the end of the recording is thought of."""
 BUFFERED_N = 8
 """Pictures decoded ahead of the reader."""
 WAITING_N = 16
@@ -198,7 +200,7 @@ class WholePlayback:
         if paired is not None:
             return paired
         try:
-            picture = self._decoded.get(timeout=max(0.001, timeout_s))
+            picture = self._decoded.get(timeout=min(max(0.001, timeout_s), PAUSE_S))
         except queue.Empty:
             return self._at_a_pause()
         if isinstance(picture, Exception):

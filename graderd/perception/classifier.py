@@ -19,6 +19,7 @@ from graderd.perception.depth import DepthJudge, HeightMap
 from graderd.perception.fused import fuse
 from graderd.perception.geometry import CENTER, LEFT, RIGHT, U8, Region, View, blade_region, image_thirds
 from graderd.perception.health import HealthMonitor
+from graderd.perception.knock import KnockWatch
 from graderd.perception.settings import CameraCalibration, Mounting, PerceptionSettings
 
 ANGLE_STEP_DEG = 0.25
@@ -60,6 +61,8 @@ class SoilClassifier:
         self._views: dict[tuple[str, Intrinsics], View] = {}
         self._judges: dict[Intrinsics, DepthJudge] = {}
         self._regions: OrderedDict[tuple[object, ...], Region | None] = OrderedDict()
+        # Stills have nothing to do with each other, and a look at one in ten says nothing about the next.
+        self._knock = KnockWatch(self._knocked) if live else None
 
     @property
     def settings(self) -> PerceptionSettings:
@@ -158,21 +161,28 @@ class SoilClassifier:
         faults = self._health.blurred(frame.color_bgr, region)
         if faults:
             return Verdict(Zone.UNKNOWN, 0.0, ""), faults
-        if settings.method == "paper":
-            return self._said(frame, paper_verdict(frame.color_bgr, region, settings.color, settings.decision)), []
-        if settings.method == "fast_color":
-            verdict = fast_color_verdict(frame.color_bgr, region, settings.color, settings.decision)
-            return self._said(frame, verdict), []
+        if settings.method in ("paper", "fast_color"):
+            by_color = paper_verdict if settings.method == "paper" else fast_color_verdict
+            verdict = by_color(frame.color_bgr, region, settings.color, settings.decision)
+            return self._said(frame, verdict), self._knocked_meanwhile(frame, angle_deg)
         judge = self._depth_judge(frame)
         if judge is None or frame.depth_mm is None:
             return Verdict(Zone.UNKNOWN, 0.0, "no calibration of the depth picture applies"), []
         soil = judge.height_map(frame.depth_mm, angle_deg)
         by_depth = judge.verdict(soil)
-        faults = self._health.knocked(soil.ground, soil.blade, settings.depth)
+        faults = self._knocked(soil)
         if settings.method == "depth" or faults:
             return by_depth, faults
-        by_color = fast_color_verdict(frame.color_bgr, region, settings.color, settings.decision)
-        return fuse(by_depth, by_color), []
+        cross_check = fast_color_verdict(frame.color_bgr, region, settings.color, settings.decision)
+        return fuse(by_depth, cross_check), []
+
+    def _knocked(self, soil: HeightMap) -> list[PictureFault]:
+        return self._health.knocked(soil.ground, soil.blade, self._settings.depth)
+
+    def _knocked_meanwhile(self, frame: Frame, angle_deg: float) -> list[PictureFault]:
+        if self._knock is None:
+            return []
+        return self._knock.check(lambda: self.height_map(frame, angle_deg))
 
     def _said(self, frame: Frame, verdict: Verdict) -> Verdict:
         if self.color_view(frame) is not None:

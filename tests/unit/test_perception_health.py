@@ -20,7 +20,7 @@ from graderd.core.blade import BladeGeometry
 from graderd.core.zones import SoilObservation, Zone
 from graderd.hal.camera import Frame
 from graderd.hal.settings import CameraSettings
-from graderd.perception import METHODS, CameraCalibration, Method, PerceptionSettings, make_classifier
+from graderd.perception import METHODS, CameraCalibration, Classifier, Method, PerceptionSettings, make_classifier
 from tests.perception_scenes import PoseError, Scene, render
 
 ANGLE_DEG = 10.0
@@ -151,6 +151,26 @@ def test_a_mount_that_gives_a_little_is_not_knocked(zone: Zone, sign: int) -> No
     observation = judge(picture(pose, zone=zone))
     assert named(observation) == []
     assert observation.zone is zone
+
+
+@pytest.mark.parametrize("method", ["paper", "fast_color"])
+def test_a_knocked_camera_under_a_colour_method(method: Method) -> None:
+    """The blade is looked for in the depth picture now and then, although the method does not use it."""
+    classifier = make_classifier(PerceptionSettings(method=method), CameraCalibration(), BladeGeometry())
+    assert stream(classifier, PoseError(), 12) == []
+    assert stream(classifier, PoseError(y_m=0.12), 12) == ["knocked"]
+    assert stream(classifier, PoseError(), 12) == []  # clears when it is back
+
+
+def stream(classifier: Classifier, pose: PoseError, count: int) -> list[str]:
+    """What the last of ``count`` live frames from this camera pose is said to lack."""
+    still = picture(pose)
+    said: list[str] = []
+    for number in range(count):
+        color = still.color_bgr.copy()
+        color[number % 8 :: 8, number % 16 :: 16] ^= 1  # or it would be frozen
+        said = named(classifier.classify(replace(still, color_bgr=color), ANGLE_DEG, 0.0))
+    return said
 
 
 def test_soil_heaped_against_the_face_is_not_taken_for_the_face() -> None:
