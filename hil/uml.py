@@ -34,6 +34,7 @@ MODULES = Path("/usr/lib/uml/modules")
 BUSYBOX = Path("/bin/busybox")
 INIT = Path(__file__).with_name("guest") / "init"
 PREFERENCE = -10
+MEMORY_MIB = 2048
 PASSED_ON = ("PYTEST_ARGS", "GRADERD_HIL_SEED", "GRADERD_SOAK_S", "TERM")
 
 
@@ -49,7 +50,7 @@ class Guest:
     out: Path
     directory: Path = field(default_factory=Path.cwd)
     timeout_s: float = 600.0
-    memory_mib: int = 3072
+    memory_mib: int = MEMORY_MIB
     kernel: Path = KERNEL
     root: Path = Path("/")
     kernel_args: tuple[str, ...] = ()
@@ -121,6 +122,16 @@ class Guest:
         ]
 
 
+def cannot() -> str:
+    """Why no guest runs here; empty where one does (tried, which takes some seconds)."""
+    if absent := missing():
+        return f"no {', '.join(absent)}: run `sudo hil/setup` (Debian, Ubuntu) once"
+    with tempfile.TemporaryDirectory(prefix="graderd-hil-out-") as out:
+        status = Guest(("/bin/true",), Path(out), directory=Path("/"), timeout_s=120.0).run(follow=False)
+        said = (Path(out) / "console").read_text(encoding="utf-8", errors="replace").split("\n")
+    return "" if status == 0 else f"a guest does not start (status {status}): {' / '.join(said[-4:])}"
+
+
 def end_in_order() -> None:
     """Let SIGTERM unwind the main program, so that a terminated launcher still takes its guest away."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
@@ -176,23 +187,42 @@ def _on_one_processor(place_n: int | None) -> Iterator[None]:
 def _guest_process(command: Sequence[str], output_fd: int, scratch: str) -> Iterator[subprocess.Popen[bytes]]:
     """The kernel in a process group of its own, all of which is gone afterwards whatever happens."""
     # The kernel keeps its memory and its sockets in these; the scratch directory takes them away again.
-    environment = {**os.environ, "TMPDIR": "/dev/shm" if os.access("/dev/shm", os.W_OK) else scratch, "HOME": scratch}
+    environment = {**os.environ, "TMPDIR": _place_for_memory() or scratch, "HOME": scratch}
     # The kernel keeps a descriptor for each file of the host the guest has looked at.
     resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
     process = subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=output_fd, stderr=output_fd, env=environment, start_new_session=True
     )
-    # A guest that waits for the host's processor misses deadlines that a machine would meet. The scheduler weighs
-    # sessions against each other where it groups by session, else processes; both need privilege.
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, process.pid, PREFERENCE)
-        Path(f"/proc/{process.pid}/autogroup").write_text(str(PREFERENCE), encoding="ascii")
+    _weigh(process.pid)
     try:
         yield process
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
+
+
+def _weigh(pid: int) -> None:
+    """Give the guest preference over the rest of the host, unless the launcher was started with `nice`.
+
+    A guest that waits for the host's processor misses deadlines that a machine would meet. The scheduler weighs
+    sessions against each other where it groups by session, else processes; both need privilege.
+    """
+    niceness = os.getpriority(os.PRIO_PROCESS, 0)
+    wanted = niceness if niceness > 0 else PREFERENCE
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, pid, wanted)
+        Path(f"/proc/{pid}/autogroup").write_text(str(wanted), encoding="ascii")
+
+
+def _place_for_memory() -> str:
+    """A memory file system that is large enough and may hold programs (a container's /dev/shm often is neither)."""
+    try:
+        shm = os.statvfs("/dev/shm")
+    except OSError:
+        return ""
+    enough = shm.f_bavail * shm.f_frsize > 2 * MEMORY_MIB << 20
+    return "/dev/shm" if enough and not shm.f_flag & os.ST_NOEXEC and os.access("/dev/shm", os.W_OK) else ""
 
 
 def _follow(path: Path, done: Event) -> None:
@@ -212,7 +242,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line of the launcher."""
     parser = argparse.ArgumentParser(prog="python3 -m hil.uml", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("-t", "--timeout", type=float, default=600.0, metavar="SECONDS")
-    parser.add_argument("-m", "--memory", type=int, default=3072, metavar="MIB")
+    parser.add_argument("-m", "--memory", type=int, default=MEMORY_MIB, metavar="MIB")
     parser.add_argument("-o", "--out", type=Path, help="keep log, journal, console and result files here")
     parser.add_argument("command", nargs="+", help="what to run in the guest, after --")
     options = parser.parse_args(arguments)
