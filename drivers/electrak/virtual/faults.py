@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from drivers.electrak.virtual.model import VirtualElectrak
-from drivers.electrak.virtual.traits import Behaviour, Faults
+from drivers.electrak.virtual.traits import Behaviour
 
 UNIT_FAULTS: Final = (
     "babble",
@@ -86,7 +86,7 @@ def inject(unit: VirtualElectrak, fault: str, params: dict[str, float]) -> None:
 
 def clear(unit: VirtualElectrak) -> None:
     """Make the unit healthy: no defect, normal supply and temperature, no load, own address, power on."""
-    unit.faults = Faults()
+    unit.faults.clear()
     unit.behaviour.speed_factor = Behaviour().speed_factor
     unit.supply_v, unit.temperature_c, unit.load_n = 12.5, 25.0, 0.0
     unit.manual_override = None

@@ -1,4 +1,4 @@
-"""One virtual Electrak: motor, screw and J1939 controller of a single unit, without a wire and without a clock.
+"""One virtual Electrak: the J1939 controller of a single unit over its motor, without a wire and without a clock.
 
 The caller moves time (:meth:`VirtualElectrak.advance`), hands in frames (:meth:`VirtualElectrak.on_frame`) and takes
 away what the unit sends. Physics and behaviour follow the profile's figures; every doubtful trait is a knob of
@@ -14,14 +14,11 @@ from typing import Final, Literal
 from drivers.electrak.codec import Control, ElectrakCodec, Feedback
 from drivers.electrak.j1939.ids import GLOBAL, NULL, Frame, Pgn, destination_of, make_id, pgn_of, source_of
 from drivers.electrak.j1939.name import Name
-from drivers.electrak.profile import load_profile
-from drivers.electrak.virtual.traits import Behaviour, Faults, MotorState
+from drivers.electrak.profile import Figures, load_profile
+from drivers.electrak.virtual.motor import Motor
+from drivers.electrak.virtual.traits import Behaviour, Faults
 
 _STEP_S: Final = 0.002
-_BRAKE_S: Final = 0.02
-"""Time constant with which the tube stops once the motor is braked."""
-_INRUSH_FACTOR: Final = 1.6
-_OVERRIDE_DUTY_PERCENT: Final = 100.0
 
 
 class VirtualElectrak:
@@ -42,25 +39,20 @@ class VirtualElectrak:
         asleep: bool = True,
     ) -> None:
         self.profile = load_profile(profile)
-        self.figures = self.profile.figures
+        figures = self.profile.figures
         self.behaviour = Behaviour()
         self.faults = Faults()
-        self.address = self.figures.default_address_n if address is None else address
+        self.address = figures.default_address_n if address is None else address
         self.name = Name(
-            identity=identity, manufacturer=self.figures.manufacturer_n, function=255, arbitrary_address_capable=1
+            identity=identity, manufacturer=figures.manufacturer_n, function=255, arbitrary_address_capable=1
         )
-        self.load_n = 0.0
         self.supply_v = 12.5
         self.temperature_c = 25.0
         self.fatal = False
-        self.manual_override: Literal["extend", "retract"] | None = None
         self._home_address = self.address
         self._codec = ElectrakCodec(self.profile.layout)
         self._random = random.Random(f"{seed}/{self.address}")
-        self._position_mm = min(max(position_mm, 0.0), self.figures.stroke_mm)
-        self._velocity_mm_per_s = 0.0
-        self._current_a = 0.0
-        self._motion = MotorState(target_mm=self._position_mm)
+        self._motor = Motor(figures, self.behaviour, self.faults, self._random, position_mm)
         self._now_s: float | None = None
         self._powered = True
         self._awake = not asleep
@@ -81,21 +73,48 @@ class VirtualElectrak:
     @property
     def position_mm(self) -> float:
         """True extension of the tube."""
-        return self._position_mm
+        return self._motor.position_mm
 
     @position_mm.setter
     def position_mm(self, value: float) -> None:
-        self._position_mm = min(max(value, 0.0), self.figures.stroke_mm)
+        self._motor.place(value)
 
     @property
     def velocity_mm_per_s(self) -> float:
         """True speed, positive while extending."""
-        return self._velocity_mm_per_s
+        return self._motor.velocity_mm_per_s
 
     @property
     def current_a(self) -> float:
         """Motor current."""
-        return self._current_a
+        return self._motor.current_a
+
+    @property
+    def figures(self) -> Figures:
+        """What this unit can do; another one's may be put in while it runs."""
+        return self._motor.figures
+
+    @figures.setter
+    def figures(self, value: Figures) -> None:
+        self._motor.figures = value
+
+    @property
+    def load_n(self) -> float:
+        """Newtons against extension."""
+        return self._motor.load_n
+
+    @load_n.setter
+    def load_n(self, value: float) -> None:
+        self._motor.load_n = value
+
+    @property
+    def manual_override(self) -> Literal["extend", "retract"] | None:
+        """The switch at the unit that moves it past its bus."""
+        return self._motor.manual_override
+
+    @manual_override.setter
+    def manual_override(self, value: Literal["extend", "retract"] | None) -> None:
+        self._motor.manual_override = value
 
     @property
     def awake(self) -> bool:
@@ -110,19 +129,18 @@ class VirtualElectrak:
     @property
     def overloaded(self) -> bool:
         """Whether the overload latch is set."""
-        return self._motion.overload
+        return self._motor.state.overload
 
     @property
     def motion_enabled(self) -> bool:
         """Whether the last control message that counted allows motion."""
-        return self._motion.enabled
+        return self._motor.state.enabled
 
     def cut_power(self) -> None:
         """Take the supply away: motion ends, the holding brake keeps the tube, everything volatile is forgotten."""
         self._powered = False
         self._awake = False
-        self._velocity_mm_per_s = self._current_a = 0.0
-        self._motion = MotorState(target_mm=self._position_mm)
+        self._motor.cut()
         self._out.clear()
         self._claim_due_s = None
 
@@ -149,7 +167,7 @@ class VirtualElectrak:
                 self._wake(now_s)
         while self._now_s < now_s:
             step_s = min(_STEP_S, now_s - self._now_s)
-            if not self._busy:
+            if not self._motor.busy:
                 step_s = now_s - self._now_s
             self._now_s += step_s
             self._move(self._now_s, step_s)
@@ -159,20 +177,25 @@ class VirtualElectrak:
             return []
         return out
 
-    @property
-    def _busy(self) -> bool:
-        motion = self._motion
-        return bool(
-            motion.direction or self._velocity_mm_per_s or motion.enabled or self.manual_override
-            or self.faults.drift_mm_per_s or motion.over_limit_since_s is not None
-        )  # fmt: skip
+    def _move(self, now_s: float, step_s: float) -> None:
+        """Let the motor do what the controller allows."""
+        powered = self._powered and not self.fatal
+        quiet_s = now_s - self._last_activity_s
+        lost = self.behaviour.acm_loss == "stop" and quiet_s > self.figures.sleep_after_s
+        refused = self._motor.state.parameter and self.behaviour.parameter_refuses_motion
+        obeys = self._awake and not lost and not refused
+        self._motor.move(now_s, step_s, powered=powered, obeys=obeys, may_start=self._in_range)
+
+    def _in_range(self) -> bool:
+        """Out of range a move in progress is completed, and a new one refused."""
+        return not self._flags() & {"voltage_low", "voltage_high", "temperature_low", "temperature_high"}
 
     def _talk(self, now_s: float) -> None:
         if not self._powered:
             return
         if self._awake and now_s - self._last_activity_s > self.figures.sleep_after_s and not self.manual_override:
             self._awake = False
-            self._motion.enabled = False
+            self._motor.state.enabled = False
             self._claim_due_s = None
         if self._claim_due_s is not None and now_s >= self._claim_due_s:
             self._claim_due_s = None
@@ -201,23 +224,23 @@ class VirtualElectrak:
     def feedback(self) -> Feedback:
         """What the unit would report now."""
         noise_mm = self._random.choice((-1, 0, 0, 1)) * self.figures.position_noise_mm
-        reported_mm = min(max(round(self._position_mm + noise_mm, 1), 0.0), self.figures.stroke_mm)
-        motion = self._motion
+        reported_mm = min(max(round(self._motor.position_mm + noise_mm, 1), 0.0), self.figures.stroke_mm)
+        motion = self._motor.state
         return Feedback(
             position_mm=reported_mm,
-            current_a=min(round(self._current_a, 1), self.figures.measured_current_max_a),
+            current_a=min(round(self._motor.current_a, 1), self.figures.measured_current_max_a),
             duty_percent=5.0 * round(motion.duty_percent / 5.0),
-            moving=abs(self._velocity_mm_per_s) > 0.5,
+            moving=abs(self._motor.velocity_mm_per_s) > 0.5,
             flags=self._flags(),
         )
 
     def _flags(self) -> frozenset[str]:
-        figures, motion = self.figures, self._motion
+        figures, motion = self.figures, self._motor.state
         states = {
             "overload": motion.overload,
             "backdrive": motion.backdrive_mm > 0.5,
             "parameter": motion.parameter,
-            "saturation": self._current_a >= 0.9 * figures.current_full_load_a and motion.direction != 0,
+            "saturation": self._motor.saturated,
             "fatal": self.fatal,
             "voltage_low": self.supply_v < figures.supply_min_v,
             "voltage_high": self.supply_v > figures.supply_max_v,
@@ -225,98 +248,6 @@ class VirtualElectrak:
             "temperature_high": self.temperature_c > figures.temperature_max_c,
         }
         return frozenset(flag for flag, is_set in states.items() if is_set) | self.faults.forced_flags
-
-    # -- motor and screw --------------------------------------------------------------------------------------------
-
-    def _move(self, now_s: float, step_s: float) -> None:
-        motion, figures = self._motion, self.figures
-        wanted_percent, direction = self._wanted(now_s)
-        if direction != motion.direction:
-            if direction:
-                motion.moving_since_s = now_s
-            motion.direction = direction
-            motion.duty_percent = 0.0
-        if not direction:
-            motion.duty_percent = 0.0
-        elif wanted_percent > motion.duty_percent:
-            ramp_percent = wanted_percent * step_s / figures.soft_start_s
-            motion.duty_percent = min(wanted_percent, motion.duty_percent + ramp_percent)
-        else:
-            motion.duty_percent = wanted_percent
-        opposing_n = self.load_n * direction
-        blocked = self.faults.stuck or self._at_end(direction)
-        speed_mm_per_s = figures.speed_mm_per_s(motion.duty_percent, opposing_n) * self.behaviour.speed_factor
-        aim_mm_per_s = 0.0 if blocked else direction * speed_mm_per_s
-        # with the motor on, the screw follows the duty; with it off, the brake takes some 20 ms
-        slack = 1.0 if blocked else 1.0 - math.exp(-step_s / _BRAKE_S)
-        self._velocity_mm_per_s += (aim_mm_per_s - self._velocity_mm_per_s) * slack
-        if not direction and abs(self._velocity_mm_per_s) < 0.2:
-            self._velocity_mm_per_s = 0.0
-        self._position_mm += (self._velocity_mm_per_s + self.faults.drift_mm_per_s) * step_s
-        self._position_mm = min(max(self._position_mm, 0.0), figures.stroke_mm)
-        drift_mm = abs(self.faults.drift_mm_per_s) * step_s
-        motion.backdrive_mm = motion.backdrive_mm + drift_mm if drift_mm and not direction else 0.0
-        self._current(now_s, step_s, direction, opposing_n)
-
-    def _current(self, now_s: float, step_s: float, direction: int, opposing_n: float) -> None:
-        motion, figures = self._motion, self.figures
-        if not direction:
-            self._current_a *= math.exp(-step_s / 0.05)
-            if self._current_a < 0.05:
-                self._current_a = 0.0
-            motion.over_limit_since_s = None
-            return
-        running_a = figures.current_a(opposing_n)
-        if self.faults.stuck:
-            running_a = 1.5 * figures.current_full_load_a
-        starting = now_s - motion.moving_since_s < figures.inrush_s
-        self._current_a = running_a * (_INRUSH_FACTOR if starting else 1.0)
-        if starting or self.manual_override or running_a <= motion.limit_a:
-            motion.over_limit_since_s = None
-        elif motion.over_limit_since_s is None:
-            motion.over_limit_since_s = now_s
-        elif now_s - motion.over_limit_since_s >= figures.overload_hold_s:
-            motion.overload = True
-            motion.over_limit_since_s = None
-
-    def _wanted(self, now_s: float) -> tuple[float, int]:
-        """Duty and direction that the controller asks of the motor."""
-        motion, figures = self._motion, self.figures
-        if not self._powered or self.fatal:
-            return 0.0, 0
-        if self.manual_override:
-            direction = 1 if self.manual_override == "extend" else -1
-            return (0.0, 0) if self._at_end(direction) else (_OVERRIDE_DUTY_PERCENT, direction)
-        quiet_s = now_s - self._last_activity_s
-        lost = self.behaviour.acm_loss == "stop" and quiet_s > figures.sleep_after_s
-        refused = motion.parameter and self.behaviour.parameter_refuses_motion
-        if not (self._awake and motion.enabled) or motion.overload or lost or refused:
-            return 0.0, 0
-        error_mm = motion.target_mm - self._position_mm
-        direction = 1 if error_mm > 0 else -1
-        if motion.direction == 0:
-            if abs(error_mm) <= figures.restart_zone_mm or motion.speed_percent < figures.speed_min_percent:
-                return 0.0, 0
-            out_of_range = self._flags() & {"voltage_low", "voltage_high", "temperature_low", "temperature_high"}
-            if out_of_range:  # a move in progress completes, a new one is refused
-                return 0.0, 0
-            spread_mm = figures.dead_zone_spread_mm
-            motion.stop_short_mm = figures.dead_zone_mm + self._random.uniform(-spread_mm, spread_mm)
-        brake_mm = abs(self._velocity_mm_per_s) * _BRAKE_S
-        if abs(error_mm) <= motion.stop_short_mm + brake_mm:
-            return 0.0, 0
-        if self._at_end(direction):
-            return 0.0, 0
-        if motion.direction and direction != motion.direction:
-            return 0.0, 0  # stop first, then turn round
-        taper = abs(error_mm) <= figures.taper_from_mm
-        cap_percent = figures.taper_speed_percent if taper else 100.0
-        return min(motion.speed_percent, cap_percent), direction
-
-    def _at_end(self, direction: int) -> bool:
-        if direction > 0:
-            return self._position_mm >= self.figures.stroke_mm
-        return direction < 0 and self._position_mm <= 0.0
 
     # -- the wire ---------------------------------------------------------------------------------------------------
 
@@ -349,8 +280,8 @@ class VirtualElectrak:
         self._woken_at_s = now_s
         self._last_activity_s = now_s
         self._control_since_wake_n = 0
-        self._motion.enabled = False
-        self._motion.direction = 0
+        self._motor.state.enabled = False
+        self._motor.state.direction = 0
         self._claim_due_s = now_s + self.figures.wake_claim_s * self._random.uniform(0.65, 1.0)
         self._afm_due_s = now_s + self.figures.wake_feedback_s * self._random.uniform(0.7, 1.0)
 
@@ -382,7 +313,7 @@ class VirtualElectrak:
                     self._claim()
 
     def _on_control(self, data: bytes, source: int, now_s: float) -> None:
-        motion, figures = self._motion, self.figures
+        motion, figures = self._motor.state, self.figures
         control = self._codec.decode_control(data)
         self.received_control = [*self.received_control[-49:], control]
         self._control_since_wake_n += 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 
@@ -38,6 +38,11 @@ class Faults:
     babble_hz: float = 0.0
     frozen_feedback: bool = False
     forced_flags: frozenset[str] = frozenset()
+
+    def clear(self) -> None:
+        """All of them off."""
+        for name, value in asdict(Faults()).items():
+            setattr(self, name, value)
 
 
 @dataclass(slots=True)
