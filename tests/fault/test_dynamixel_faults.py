@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from drivers.dynamixel import Ph54Rotator
+from drivers.dynamixel.keeper import ServoKeeper
 from drivers.dynamixel.virtual import FAULTS, VirtualServo, VirtualServoBus
 from graderd.hal.errors import DeviceError, DeviceMissingError, DeviceRefusedError, DeviceTimeoutError, WrongDeviceError
 from graderd.hal.lifecycle import Lifecycle
@@ -414,7 +415,7 @@ async def test_the_servo_task_comes_back_when_it_is_killed(rig: Bench) -> None:
 
 async def test_an_unexpected_exception_does_not_end_the_search(rig: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(Ph54Rotator, "_cycle", lambda *_, **__: 1 / 0)
+        patch.setattr(ServoKeeper, "_cycle", lambda *_, **__: 1 / 0)
         await rig.until(lambda: rig.rotator.lifecycle is Lifecycle.FAILED)
     await works_again(rig)
 
