@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import collections
 import math
 from typing import Final
 
-from drivers.electrak.codec import Control, ElectrakCodec, Feedback
+from drivers.electrak.codec import Control, ElectrakCodec
 from drivers.electrak.link import CanLink
 from drivers.electrak.monitor import DISARMING, FAILING, INFORMATIVE, LATCHING, FaultMemory, FeedbackMonitor
 from drivers.electrak.overload import OverloadPolicy, Verdict
-from drivers.electrak.planner import Motion, MotionPlanner
+from drivers.electrak.planner import MotionPlanner
 from drivers.electrak.profile import load_profile
 from drivers.electrak.thermal import ThermalGuard
+from drivers.electrak.track import RECOVERY_N, TRUST_N, FeedbackTrack
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import (
     CommandRangeError,
@@ -29,12 +29,7 @@ from graderd.hal.reading import Reading
 from graderd.hal.settings import ActuatorSettings
 
 WAKE_TIMEOUT_S: Final = 3.0
-_RECOVERY_N: Final = 3
-"""Feedback messages in a row after which a lost actuator is back."""
-_TRUST_N: Final = 10
-"""Plausible messages in a row after which feedback is believed again."""
 _CLOSE_REPEATS_N: Final = 3
-_VELOCITY_N: Final = 3
 
 
 class ElectrakActuator:
@@ -66,12 +61,8 @@ class ElectrakActuator:
         self._thermal = ThermalGuard(figures)
         self._lifecycle = Lifecycle.CLOSED
         self._opened_at_s = 0.0
-        self._feedback: Feedback | None = None
-        self._feedback_at_s = -math.inf
-        self._track: collections.deque[tuple[float, float]] = collections.deque(maxlen=_VELOCITY_N)
-        self._velocity_mm_per_s = 0.0
+        self._track = FeedbackTrack(figures)
         self._heard = asyncio.Event()
-        self._good_n = 0
         self._target_at_s = 0.0
         self._sent: Reading[float] | None = None
         self._sent_enabled = False
@@ -99,7 +90,7 @@ class ElectrakActuator:
 
     def telemetry(self) -> ActuatorTelemetry:
         """Newest readings, each with its time."""
-        feedback, at_s = self._feedback, self._feedback_at_s
+        feedback, at_s = self._track.feedback, self._track.feedback_at_s
         counters = {
             **self._counters,
             "overloads_n": self._overload.overloads_n,
@@ -109,7 +100,7 @@ class ElectrakActuator:
             return ActuatorTelemetry(thermal_load=self._thermal.load, target_sent_mm=self._sent, counters=counters)
         return ActuatorTelemetry(
             position_mm=Reading(feedback.position_mm, at_s),
-            velocity_mm_per_s=Reading(self._velocity_mm_per_s, at_s),
+            velocity_mm_per_s=Reading(self._track.velocity_mm_per_s, at_s),
             current_a=Reading(feedback.current_a, at_s),
             duty_percent=Reading(feedback.duty_percent, at_s),
             moving=Reading(feedback.moving, at_s),
@@ -123,7 +114,7 @@ class ElectrakActuator:
         """Conditions present now; those that latch stay until the next arm, marked as latched once they are over."""
         now_s = self._clock.now_s()
         self._watch(now_s)
-        return self._faults.all(now_s, self._feedback.flags if self._feedback else frozenset())
+        return self._faults.all(now_s, self._track.flags)
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -168,11 +159,9 @@ class ElectrakActuator:
             raise LifecycleError(self.name, f"cannot arm while {self._lifecycle}", self._remedy())
         if self._link.address is None:
             raise DeviceRefusedError(self.name, "graderd has no J1939 address yet", "Wait, or look at the can faults")
-        if now_s - self._feedback_at_s > self.settings.feedback_timeout_s:
-            raise DeviceTimeoutError(self.name, f"feedback is {now_s - self._feedback_at_s:.2f} s old")
-        feedback = self._feedback
-        flags = feedback.flags if feedback else frozenset()
-        standing = [flag for flag in ("overload", "fatal") if flag in flags]
+        if self._track.age_s(now_s) > self.settings.feedback_timeout_s:
+            raise DeviceTimeoutError(self.name, f"feedback is {self._track.age_s(now_s):.2f} s old")
+        standing = [flag for flag in ("overload", "fatal") if flag in self._track.flags]
         self._faults.clear(*(LATCHING - set(standing)))
         left = self._faults.names() - INFORMATIVE
         if left:
@@ -248,37 +237,34 @@ class ElectrakActuator:
         try:
             feedback = self._codec.decode_feedback(data)
         except ValueError as error:
-            self._good_n = 0
+            self._track.good_n = 0
             self._monitor.on_garbage(str(error), now_s)
             self._watch(now_s)
             return
-        if now_s - self._feedback_at_s > self.settings.feedback_timeout_s:
-            self._good_n = 0
-            self._track.clear()
+        if self._track.age_s(now_s) > self.settings.feedback_timeout_s:
+            self._track.begin_anew()
             self._monitor.reset(now_s)
         sent = self._sent
         remaining_mm = abs(sent.value - feedback.position_mm) if sent and self._sent_enabled else 0.0
         if not self._monitor.on_feedback(feedback, self._planner.direction, remaining_mm, now_s):
-            self._good_n = 0
+            self._track.good_n = 0
             self._watch(now_s)
             return
         self._counters["feedback_n"] += 1
-        self._feedback, self._feedback_at_s = feedback, now_s
-        self._velocity(feedback, now_s)
+        self._track.take(feedback, now_s)
         self._thermal.update(feedback.current_a, now_s)
-        self._planner.on_feedback(self._motion(now_s))
-        self._good_n += 1
+        self._planner.on_feedback(self._track.motion(now_s))
         self._heard.set()
-        if self._good_n >= _RECOVERY_N:
+        if self._track.good_n >= RECOVERY_N:
             self._faults.clear("no_feedback", "wrong_address")
-        if self._good_n >= _TRUST_N:
+        if self._track.good_n >= TRUST_N:
             self._faults.clear("implausible_feedback")
         self._on_overload_flag("overload" in feedback.flags, now_s)
         self._watch(now_s)
 
     def on_claim(self, name: int, solicited: bool, now_s: float) -> None:
         """An address claim from this address: an unasked one of a unit that was awake means that it restarted."""
-        awake = now_s - self._feedback_at_s < 2.0
+        awake = self._track.age_s(now_s) < 2.0
         moved_in = self._claimed_name is not None and name != self._claimed_name
         self._claimed_name = name
         if self._lifecycle is Lifecycle.CLOSED or (solicited and not moved_in) or not awake:
@@ -290,7 +276,7 @@ class ElectrakActuator:
 
     def on_link_lost(self, now_s: float) -> None:
         """The bus is gone."""
-        self._good_n = 0
+        self._track.good_n = 0
         self._sent_enabled = False
         self._faults.set("no_feedback", f"{self._link.where} is lost", now_s)
         self._fail()
@@ -298,7 +284,7 @@ class ElectrakActuator:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _next_control(self, now_s: float) -> Control:
-        feedback = self._feedback
+        feedback = self._track.feedback
         here_mm = feedback.position_mm if feedback else 0.0
         if self._lifecycle is not Lifecycle.ACTIVE or feedback is None:
             return self._planner.disabled(here_mm)
@@ -306,25 +292,7 @@ class ElectrakActuator:
             self._counters["target_timeouts_n"] += 1
             self._planner.hold()
         may_move = self._thermal.may_move(now_s) and not self._overload.waiting
-        return self._planner.control(self._motion(now_s), may_move=may_move)
-
-    def _motion(self, now_s: float) -> Motion:
-        feedback = self._feedback
-        if feedback is None:
-            return Motion(0.0, 0.0, moving=False, age_s=0.0)
-        age_s = max(0.0, now_s - self._feedback_at_s)
-        return Motion(feedback.position_mm, self._velocity_mm_per_s, feedback.moving, age_s)
-
-    def _velocity(self, feedback: Feedback, now_s: float) -> None:
-        self._track.append((now_s, feedback.position_mm))
-        if not feedback.moving and feedback.duty_percent == 0:
-            self._velocity_mm_per_s = 0.0
-            return
-        first_s, first_mm = self._track[0]
-        if now_s - first_s > 0.5 * self.profile.figures.afm_period_s:
-            fastest = 1.1 * self.profile.figures.speed_no_load_mm_per_s
-            velocity = (feedback.position_mm - first_mm) / (now_s - first_s)
-            self._velocity_mm_per_s = min(max(velocity, -fastest), fastest)
+        return self._planner.control(self._track.motion(now_s), may_move=may_move)
 
     def _on_overload_flag(self, tripped: bool, now_s: float) -> None:
         verdict = self._overload.on_feedback(tripped, self._lifecycle is Lifecycle.ACTIVE, now_s)
@@ -339,9 +307,9 @@ class ElectrakActuator:
         """Draw the consequences: lost feedback fails the axis, disarming faults take it out of the active state."""
         if self._lifecycle is Lifecycle.CLOSED:
             return
-        age_s = now_s - max(self._feedback_at_s, self._opened_at_s)
+        age_s = now_s - max(self._track.feedback_at_s, self._opened_at_s)
         if age_s > self.settings.feedback_timeout_s:
-            self._good_n = 0
+            self._track.good_n = 0
             strangers = [a for a in self._link.feedback_strangers(now_s) if 19 <= a <= 42]
             detail = f"no feedback from address {self.address} for {age_s:.2f} s"
             if strangers and self._link.is_open:
@@ -371,11 +339,8 @@ class ElectrakActuator:
         self._planner.hold()
         self._monitor.reset(now_s)
         self._faults.clear(*self._faults.names())
-        self._feedback, self._feedback_at_s = None, -math.inf
-        self._velocity_mm_per_s = 0.0
-        self._track.clear()
+        self._track.forget()
         self._heard.clear()
-        self._good_n = 0
         self._sent, self._sent_enabled = None, False
         self._overload.rearm()
         self._claimed_name = None

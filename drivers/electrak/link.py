@@ -12,7 +12,7 @@ import contextlib
 import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from typing import Final
 
 from drivers.electrak.bus_events import BusEvent
 from drivers.electrak.bus_health import BusHealth
@@ -21,6 +21,7 @@ from drivers.electrak.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
 from drivers.electrak.j1939.name import Name
 from drivers.electrak.j1939.node import Identity, J1939Node
 from drivers.electrak.j1939.transport import Message
+from drivers.electrak.link_user import LinkUser
 from drivers.electrak.ports import BusPort, PortFullError, PortLostError, open_port
 from drivers.electrak.stop import StopWatcher
 from drivers.electrak.ticker import Ticker
@@ -42,35 +43,6 @@ _CLOSE_REPEATS_N: Final = 3
 _ACM_PRIORITY: Final = 6
 _AFM_MASK: Final = 0x03FFFF00
 _AFM_MATCH: Final = 0x01EFFF00
-
-
-class LinkUser(Protocol):
-    """What the link wants of an actuator. The methods never wait."""
-
-    @property
-    def address(self) -> int:
-        """J1939 address of the actuator."""
-        ...
-
-    def control_data(self, now_s: float) -> bytes:
-        """Content of the control message that goes out now."""
-        ...
-
-    def on_feedback(self, data: bytes, now_s: float) -> None:
-        """A feedback message from this address."""
-        ...
-
-    def on_claim(self, name: int, solicited: bool, now_s: float) -> None:
-        """An address claim from this address; ``solicited`` where somebody asked for claims just before."""
-        ...
-
-    def on_link_lost(self, now_s: float) -> None:
-        """The bus is gone; nothing can be sent."""
-        ...
-
-    def hold(self) -> None:
-        """Disable motion from the next control message on."""
-        ...
 
 
 @dataclass(slots=True)
