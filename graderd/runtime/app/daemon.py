@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
 import logging
 import shutil
@@ -68,7 +69,11 @@ async def _main(config: Config, sim: bool, rig_dir: Path | None) -> None:
             config = attach(config, rig.directory)
         elif rig_dir is not None:
             config = attach(config, rig_dir)
-        await Daemon(config, rig).run()
+        daemon = Daemon(config, rig)
+        # What was imported stays for good: a full collection that looked at it would hold up several ticks.
+        gc.collect()
+        gc.freeze()
+        await daemon.run()
     finally:
         if rig is not None:
             await rig.stop()
