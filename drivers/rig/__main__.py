@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import gc
 import os
 import signal
 import sys
@@ -51,6 +52,9 @@ async def _run(directory: Path, can_channel: str | None, seed: int, linger_s: fl
         loop.add_signal_handler(number, rig.stop)
     if linger_s is not None:
         _stop_after_input(loop, rig, linger_s)
+    # What was imported stays for good: a full collection that looked at it would hold up both wires.
+    gc.collect()
+    gc.freeze()
     await rig.run()
 
 

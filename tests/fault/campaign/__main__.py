@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import gc
 import json
 import os
 import sys
@@ -38,6 +39,8 @@ def chosen(
 
 async def run(pairs: list[tuple[Case, Phase]], broken: str, quiet: bool, output: Path | None) -> list[Outcome]:
     """Run the injections one after the other on one machine; ``output`` is written anew after each."""
+    gc.collect()
+    gc.freeze()  # a client that stands still for a full collection loses its lease
     outcomes, began_s = [], time.monotonic()
     with tempfile.TemporaryDirectory(prefix="graderd-faults-") as directory:
         async with Stack(Path(directory), broken) as stack:

@@ -17,6 +17,7 @@ BRAKE_S = 0.7
 SLACK_S = 0.4
 """For a loaded machine, on top of every promise: campaign, rig, daemon and pictures share what cores there are."""
 STILL_S = 0.3
+EITHER_S = 1.0
 LATCHED_S = 1.3
 """Drivers show an event for a second; what is still told afterwards is latched."""
 EVERYTHING = tuple(MOVING)
@@ -68,8 +69,9 @@ def must_stand(fault: str, before: str) -> tuple[str, ...]:
 
 
 def decisive(case: Case, outcome: Outcome) -> str:
-    """The fault whose row says what must happen."""
-    return outcome.named if case.either and outcome.named else case.faults[0]
+    """The fault whose row says what must happen; of several that were given it is the one with the strongest."""
+    told = [fault for fault in case.faults if fault == outcome.named or fault in outcome.seen]
+    return max(told, key=lambda fault: row_of(fault).reaction) if case.either and told else case.faults[0]
 
 
 async def make_ready(stack: Stack) -> None:
@@ -132,6 +134,16 @@ async def enter(stack: Stack, phase: Phase) -> None:
         await asyncio.sleep(0.15)
 
 
+def names_in(status: JsonObject | None) -> tuple[str, ...]:
+    """The faults a status tells."""
+    return tuple(sorted(f["name"] for f in (status or {}).get("faults", [])))
+
+
+def goes_up(state: JsonObject) -> bool:
+    """Which way the lifts have room."""
+    return bool(state["lift_left_mm"] < 160.0)
+
+
 async def demand(stack: Stack, needs: str) -> None:
     """Move an axis by hand, so that a fault which only shows in motion can show."""
     await stack.command("manual")
@@ -139,7 +151,7 @@ async def demand(stack: Stack, needs: str) -> None:
     if needs == "rotation":
         await stack.move("jog", axis="rotate", value=-25.0 if state["blade_deg"] > 0 else 25.0)
     else:
-        await stack.move("jog", axis="lift", value=60.0 if state["lift_left_mm"] < 160 else -60.0, relative=True)
+        await stack.move("jog", axis="lift", value=60.0 if goes_up(state) else -60.0, relative=True)
 
 
 async def run_case(stack: Stack, case: Case, phase: Phase) -> Outcome:
@@ -213,7 +225,11 @@ async def detect(stack: Stack, case: Case, outcome: Outcome, from_s: float) -> N
 
 async def react(stack: Stack, case: Case, outcome: Outcome, from_s: float, before: str) -> None:
     """Mode, standstill and limits, against the catalogue."""
-    fault, watch = decisive(case, outcome), stack.watch
+    watch = stack.watch
+    if case.either:  # one way to notice may follow the other
+        await asyncio.sleep(EITHER_S)
+        outcome.seen = names_in(await stack.read_status())
+    fault = decisive(case, outcome)
     outcome.expected_state = expected_mode(row_of(fault).reaction, before)
     with suppress(CampaignError):
         await stack.until_status(lambda s: s["mode"] == outcome.expected_state, 1.0, "the mode does not change")
@@ -222,7 +238,7 @@ async def react(stack: Stack, case: Case, outcome: Outcome, from_s: float, befor
     # Some more time under the fault: what began to move again would be seen, and later faults would be named.
     await asyncio.sleep(0.2)
     status = await stack.read_status() or {}
-    outcome.seen = tuple(sorted(f["name"] for f in status.get("faults", [])))
+    outcome.seen = names_in(status)
     outcome.final_state = str(status.get("mode", "no answer"))
     if stopping:
         outcome.standstill_s = watch.standstill_s(stopping, from_s)
@@ -278,6 +294,9 @@ async def recover(stack: Stack, case: Case, outcome: Outcome, before: str) -> No
     await case.repair(stack)
     way = []
     mode = outcome.final_state
+    if case.either:  # what had not been noticed may be now that the cause is gone
+        await asyncio.sleep(EITHER_S)
+        mode = str((await stack.read_status() or {}).get("mode", mode))
     try:
         if row.clear is Clear.WHEN_GONE:
             await stack.until_status(lambda s: not _named(s, case.faults), case.recover_s, f"{fault} does not go away")

@@ -38,8 +38,11 @@ CANNOT = """\
 ## What this does not show
 
 - The devices are simulated. Times of real servos, actuators, adapters and cameras are measured on the machine.
-- The wall clock's step is shown to the daemon by its own process (a computer shared with others cannot have its clock
-  set); memory is taken inside the daemon, not from its control group.
+- Most faults are made from outside: processes are stopped and killed, their memory limited (`prlimit`), files filled,
+  damaged and taken away, wires pulled, sockets flooded. Three are made by a hook inside the daemon, because an ordinary
+  user cannot make them in another process: a step of the wall clock (the hook lies to the daemon about the time; the
+  hardware-in-the-loop suite sets the real clock of its guest), memory that the daemon itself takes (a leak), and an
+  event loop that one handler blocks for a second. What the child says when it lies is a child of the tests.
 - A real-time guarantee: the figures are of one run on one computer.
 """
 PHASES = tuple(phase.value for phase in Phase)

@@ -10,6 +10,7 @@ from typing import Any
 
 from drivers.rig.blade import LEVEL_TILT_MM
 from graderd.hal.errors import DeviceError
+from tests.fault.campaign.conduct import goes_up
 from tests.fault.campaign.model import ROTATION, Action, Case, Phase
 from tests.fault.campaign.stack import Stack
 
@@ -49,6 +50,15 @@ async def override_tilt(stack: Stack) -> None:
     """Somebody turns the tilt's manual override, towards the farther end of its stroke."""
     direction = -1.0 if stack.watch.newest().state["tilt_mm"] > LEVEL_TILT_MM else 1.0
     await stack.ask_rig("actuator_fault", name="manual_override", device="tilt", params={"direction": direction})
+
+
+async def overload_lift(stack: Stack) -> None:
+    """More than the left lift can move, against the way it goes or will be told to go."""
+    state = stack.watch.newest().state
+    speed = state["lift_left_velocity_mm_per_s"]
+    up = speed > 0.0 if abs(speed) > 1.0 else goes_up(state)
+    params = {"load_n": 4000.0 if up else -4000.0}
+    await stack.ask_rig("actuator_fault", name="overload", device="lift_left", params=params)
 
 
 async def turn_tilt_back(stack: Stack) -> None:
@@ -213,7 +223,8 @@ ACTUATOR = (
               own_motion=frozenset({"lift_right"})),
     _actuator("override", "is moved by its manual override", "tilt", "uncommanded_motion", "manual_override",
               inject=override_tilt, detect_s=2.0, before_arm=turn_tilt_back, own_motion=frozenset({"tilt"})),
-    _actuator("overload", "carries 4000 N", "lift_left", "overload", "overload", needs="lift", detect_s=1.5),
+    _actuator("overload", "carries 4000 N", "lift_left", "overload", "overload", inject=overload_lift, needs="lift",
+              detect_s=1.5),
     _actuator("fatal", "reports a fatal error", "tilt", "fatal", "fatal", short=(TURNING,)),
     _actuator("low_voltage", "gets 8 V", "lift_left", "voltage", "voltage_low", detect_s=1.0),
     _actuator("high_voltage", "gets 17 V", "tilt", "voltage", "voltage_high", detect_s=1.0),

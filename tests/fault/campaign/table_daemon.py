@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import resource
 import signal
 import sys
 import time
@@ -37,11 +38,28 @@ def hook(**wanted: float) -> Action:
     return inject
 
 
-async def freeze(stack: Stack) -> None:
-    """The process gets no time for a second: a swapping or suspended computer."""
-    stack.daemon.send_signal(signal.SIGSTOP)
-    await asyncio.sleep(1.0)
-    stack.daemon.send_signal(signal.SIGCONT)
+def freeze(for_s: float) -> Action:
+    """The process gets no time for so long: a computer that swaps or is suspended."""
+
+    async def inject(stack: Stack) -> None:
+        stack.daemon.send_signal(signal.SIGSTOP)
+        await asyncio.sleep(for_s)
+        stack.daemon.send_signal(signal.SIGCONT)
+
+    return inject
+
+
+async def starve_worker(stack: Stack) -> None:
+    """The kernel gives the perception child no more memory than it has: the next picture that needs some finds none."""
+    pid = stack.worker_pid()
+    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[0])
+    resource.prlimit(pid, resource.RLIMIT_AS, (pages * resource.getpagesize(), resource.RLIM_INFINITY))
+
+
+async def feed_worker(stack: Stack) -> None:
+    """There is memory again; a child that lived on what it had goes on."""
+    with suppress(CampaignError, ProcessLookupError):
+        resource.prlimit(stack.worker_pid(), resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 
 
 def _record(stack: Stack) -> Path:
@@ -328,11 +346,12 @@ def _daemon(name: str, text: str, faults: str, inject: Action, repair: Action = 
 STALLED = "rotation.watchdog_tripped daemon.loop_blocked"
 DAEMON = (
     _daemon("killed", "SIGKILL; systemd runs the guard", "", nothing, conduct=killed, short=(TURNING,)),
-    _daemon("frozen", "the process gets no time for 1 s (SIGSTOP)", STALLED, freeze, detect_s=1.8,
+    _daemon("frozen", "the process gets no time for 1 s (SIGSTOP)", STALLED, freeze(1.0), detect_s=1.8,
             stand_s=WATCHDOG_S + BRAKE_S, short=(TURNING,)),
     _daemon("blocked", "the event loop is blocked for 1 s", STALLED, hook(block_s=1.0), detect_s=1.8,
             stand_s=WATCHDOG_S + BRAKE_S, short=(TURNING, LIFTING)),
-    _daemon("overrun", "one tick comes 0.1 s late", "daemon.tick_overrun", hook(block_s=0.1)),
+    _daemon("overrun", "the process gets no time for 0.1 s (SIGSTOP)", "daemon.tick_overrun daemon.loop_blocked",
+            freeze(0.1), either=True),
     _daemon("memory", "200 MB more are used", "daemon.memory_high", hook(memory_mb=200), hook(memory_mb=0),
             detect_s=6.8),
     _daemon("disk_full", "no space left on device", "daemon.disk_full", fill_disk, empty_disk, detect_s=1.4,
@@ -367,8 +386,8 @@ PERCEPTION = (
     Case("perception_overconfident", "a confidence of 1e6", ("daemon.perception_nonsense",),
          lie('{"fields": {"confidence": 1e6}}'), tell_truth),
     Case("perception_out_of_memory", "the child gets no more memory",
-         ("camera.stale", "camera.worker_restarted", "camera.worker_hung"), lie('{"memory_error": true}'), tell_truth,
-         detect_s=0.8,
+         ("camera.stale", "camera.worker_restarted", "camera.worker_hung"), starve_worker, feed_worker,
+         detect_s=2.5,
          log_errors=("",)),
 )  # fmt: skip
 """A child without memory ends with whatever its libraries say on standard error; those lines belong to the fault."""
