@@ -57,15 +57,35 @@ def apt_install(root: Path, package: Path) -> None:
 
 
 def newer_version(package: Path, directory: Path) -> Path:
-    """The same package under a later version number, for the upgrade."""
+    """The same package under a later version number and with a later format of the configuration, for the upgrade."""
     tree = directory / "newer"
     subprocess.run(["dpkg-deb", "--raw-extract", package, tree], check=True)
     control = tree / "DEBIAN" / "control"
     lines = [f"Version: {NEWER}" if line.startswith("Version:") else line for line in control.read_text().splitlines()]
     control.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    config = tree / "opt" / "graderd" / "lib" / "common" / "graderd" / "config"
+    substitute(config / "models.py", "version: Literal[1] = 1", "version: Literal[2] = 2")
+    step = "{1: lambda document: rename(document, 'yard.zero_deg', 'rotation.zero_deg')}"
+    substitute(
+        config / "migrate.py", "STEPS: Final[Mapping[int, Step]] = {}", f"STEPS: Final[Mapping[int, Step]] = {step}"
+    )
     result = directory / f"graderd_{NEWER}.deb"
     subprocess.run(["dpkg-deb", "--root-owner-group", "-Zzstd", "-z1", "--build", tree, result], check=True, stdout=-3)
     return result
+
+
+def substitute(source: Path, old: str, new: str) -> None:
+    """Change a module of the package; its byte code, which nobody compares with it, goes.
+
+    Raises:
+        SystemExit: the text is not there (any more).
+    """
+    text = source.read_text(encoding="utf-8")
+    if text.count(old) != 1:
+        raise SystemExit(f"hil: {source.name} has no {old!r}: correct hil/package.py")
+    source.write_text(text.replace(old, new), encoding="utf-8")
+    for stale in (source.parent / "__pycache__").glob(f"{source.stem}.*.pyc"):
+        stale.unlink()
 
 
 def main() -> int:

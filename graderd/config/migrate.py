@@ -19,8 +19,9 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
 from graderd.config.loader import ConfigError, parse
+from graderd.config.models import Config
 
-CURRENT_VERSION: Final = 1
+CURRENT_VERSION: Final[int] = Config.model_fields["version"].default
 
 Document = MutableMapping[str, Any]
 Step = Callable[[Document], list[str]]
@@ -28,7 +29,10 @@ Step = Callable[[Document], list[str]]
 
 
 def rename(document: Document, old: str, new: str) -> list[str]:
-    """Move the value at the dotted place ``old`` to ``new``; nothing happens where there is none, or where both are."""
+    """Move the value at the dotted place ``old`` to ``new``; nothing happens where there is none, or where both are.
+
+    A table that is empty then goes too.
+    """
     *old_path, old_key = old.split(".")
     *new_path, new_key = new.split(".")
     source = _table(document, old_path, create=False)
@@ -39,6 +43,10 @@ def rename(document: Document, old: str, new: str) -> list[str]:
     if new_key in target:
         return []
     target[new_key] = source.pop(old_key)
+    if old_path and not source:
+        parent = _table(document, old_path[:-1], create=False)
+        assert parent is not None  # its table was found
+        del parent[old_path[-1]]
     return [f"{old} is now {new}"]
 
 
@@ -56,18 +64,8 @@ def _table(document: Document, path: list[str], *, create: bool) -> Document | N
     return found
 
 
-def _from_0(document: Document) -> list[str]:
-    """Version 0: the development snapshots before 0.1.0, which named sections after the hardware."""
-    changes = rename(document, "servo", "rotation") + rename(document, "bus", "can")
-    for side in ("left", "right"):
-        changes += rename(document, f"actuators.{side}", f"lift_{side}")
-    changes += rename(document, "actuators.tilt", "tilt")
-    if not document.get("actuators", True):
-        del document["actuators"]
-    return changes
-
-
-STEPS: Final[Mapping[int, Step]] = {0: _from_0}
+STEPS: Final[Mapping[int, Step]] = {}
+"""From each version to the next; none, as long as there has been one format only."""
 
 
 def migrate_text(text: str, steps: Mapping[int, Step] = STEPS, current: int = CURRENT_VERSION) -> tuple[str, list[str]]:
@@ -86,7 +84,7 @@ def migrate_text(text: str, steps: Mapping[int, Step] = STEPS, current: int = CU
     if not isinstance(version, int) or version > current or any(v not in steps for v in range(int(version), current)):
         raise ConfigError(
             None,
-            [f"version: {version} is not one of {sorted(steps)} or {current}. Was the file made by a newer graderd?"],
+            [f"version: {version} is not one of {[*sorted(steps), current]}. Was the file made by a newer graderd?"],
         )
     changes: list[str] = []
     for number in range(version, current):
@@ -95,7 +93,7 @@ def migrate_text(text: str, steps: Mapping[int, Step] = STEPS, current: int = CU
     return (tomlkit.dumps(document) if version < current else text), changes
 
 
-def migrate_file(path: Path) -> tuple[Path | None, list[str]]:
+def migrate_file(path: Path, steps: Mapping[int, Step] = STEPS) -> tuple[Path | None, list[str]]:
     """Bring ``path`` up to date; returns the backup's path (None where nothing was to do) and the changes.
 
     Raises:
@@ -106,7 +104,7 @@ def migrate_file(path: Path) -> tuple[Path | None, list[str]]:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(path, [f"{path}: cannot be read ({error}). Check the file"]) from None
     try:
-        new, changes = migrate_text(old)
+        new, changes = migrate_text(old, steps)
         parse(tomlkit.parse(new).unwrap(), path, new)
     except ConfigError as error:
         raise ConfigError(path, [line if str(path) in line else f"{path}: {line}" for line in error.problems]) from None

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from graderd.config import Config, ConfigError, load
-from graderd.config.migrate import CURRENT_VERSION, migrate_file, migrate_text, rename
+from graderd.config.migrate import CURRENT_VERSION, Document, migrate_file, migrate_text, rename
 
 PROJECT = Path(__file__).resolve().parents[2]
 
@@ -26,11 +26,19 @@ address_n = 21
 """
 
 
+def to_1(document: Document) -> list[str]:
+    """A step as a later version would bring one."""
+    return rename(document, "servo", "rotation") + rename(document, "actuators.left", "lift_left")
+
+
+STEPS = {0: to_1}
+
+
 def test_migration_keeps_values_and_comments_and_leaves_a_backup(tmp_path: Path) -> None:
     path = tmp_path / "graderd.toml"
     path.write_text(OLD, encoding="utf-8")
     path.chmod(0o660)
-    backup, changes = migrate_file(path)
+    backup, changes = migrate_file(path, STEPS)
     assert backup is not None
     assert backup.read_text(encoding="utf-8") == OLD
     assert changes == ["servo is now rotation", "actuators.left is now lift_left"]
@@ -48,7 +56,7 @@ def test_a_present_file_is_not_touched(tmp_path: Path) -> None:
     path = tmp_path / "graderd.toml"
     path.write_text("version=1   # odd spacing stays\n", encoding="utf-8")
     before = path.stat()
-    assert migrate_file(path) == (None, [])
+    assert migrate_file(path, STEPS) == (None, [])
     assert path.stat().st_mtime_ns == before.st_mtime_ns
     assert [entry.name for entry in tmp_path.iterdir()] == ["graderd.toml"]
 
@@ -65,7 +73,7 @@ def test_what_cannot_be_migrated_is_left_as_it_was(tmp_path: Path, text: str, sa
     path = tmp_path / "graderd.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=says):
-        migrate_file(path)
+        migrate_file(path, STEPS)
     assert path.read_text(encoding="utf-8") == text
     assert [entry.name for entry in tmp_path.iterdir()] == ["graderd.toml"]
 
@@ -73,7 +81,7 @@ def test_what_cannot_be_migrated_is_left_as_it_was(tmp_path: Path, text: str, sa
 def test_steps_run_in_order_up_to_the_present_version() -> None:
     steps = {5: lambda d: rename(d, "a.x", "b.x"), 6: lambda d: rename(d, "b.x", "b.y_deg")}
     text, changes = migrate_text("version = 5\n[a]\nx = 3\n", steps, current=7)
-    assert tomllib.loads(text) == {"version": 7, "a": {}, "b": {"y_deg": 3}}
+    assert tomllib.loads(text) == {"version": 7, "b": {"y_deg": 3}}
     assert changes == ["a.x is now b.x", "b.x is now b.y_deg"]
 
 
