@@ -6,15 +6,17 @@ import asyncio
 import json
 import os
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from graderd.core.fault_catalogue import CATALOGUE
 from graderd.core.faults import catalogue_key
-from tests.fault.campaign.__main__ import CASES, chosen
+from tests.fault.campaign.__main__ import CASES, about, chosen, joined
 from tests.fault.campaign.daemon import BREAKS
-from tests.fault.campaign.model import Phase
+from tests.fault.campaign.model import Outcome, Phase
+from tests.fault.campaign.page import write
 
 SHORT_S = 240.0
 KEYS = {
@@ -43,6 +45,21 @@ def test_the_table_is_large_enough_and_every_name_is_in_the_catalogue() -> None:
             device, _, condition = fault.partition(".")
             assert catalogue_key(device, condition) in CATALOGUE
         assert case.faults or case.conduct is not None
+
+
+def test_parts_make_up_the_whole(tmp_path: Path) -> None:
+    parts = [chosen(False, [], [], (number, 3)) for number in (1, 2, 3)]
+    assert [pair for part in parts for pair in part] == chosen(False, [], [])
+    files = []
+    for number, part in enumerate(parts):
+        results = [Outcome(case.name, phase).as_json() for case, phase in part]
+        files.append(tmp_path / f"{number}.json")
+        files[-1].write_text(json.dumps({"about": about(60.0), "results": results}), encoding="utf-8")
+    data = joined(files)
+    assert data["about"]["took_s"] == 180
+    assert len(data["results"]) == len(CASES) * len(Phase)
+    write(data, CASES, tmp_path)
+    assert f"0 of {len(data['results'])} injections passed" in (tmp_path / "fault-campaign.md").read_text("utf-8")
 
 
 @pytest.mark.serial_only
