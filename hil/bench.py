@@ -15,10 +15,11 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Final
 
-from hil.service import SOCKET, Api, Refused, Status, brief, faults, wait_for
+from hil.service import SOCKET, Api, Refused, Status, WaitError, brief, faults, wait_for
 
 RESULTS: Final = Path(__file__).resolve().parent.parent / "var" / "bench"
 RENEW_S: Final = 0.1
@@ -59,8 +60,9 @@ class Bench:
             self.contract()
             for axis, unit, step in (("rotate", "deg", 5.0), ("lift", "mm", 15.0), ("tilt", "mm", 10.0)):
                 for value in (step, -step):
-                    self.step_response(axis, unit, value)
-            self.stop_in_motion()
+                    name = f"step {axis} {value:+g} {unit}"
+                    self._attempt(name, partial(self.step_response, name, axis, unit, value))
+            self._attempt("stop in motion", self.stop_in_motion)
         finally:
             self._api.stop()
             self._api.command("reset")
@@ -91,9 +93,8 @@ class Bench:
             still = still and drift <= 0.3 and axis["lifecycle"] == "standby"
         self._note("standby: readable, still", ok=still and not faults(second), **figures)
 
-    def step_response(self, axis: str, unit: str, value: float) -> None:
+    def step_response(self, name: str, axis: str, unit: str, value: float) -> None:
         """One small relative jog: time to move, time to arrive, overshoot, rest error."""
-        name = f"step {axis} {value:+g} {unit}"
         if not self.confirmed(f"{axis} by {value:+g} {unit}"):
             self.results.append(Result(name, "skipped"))
             return
@@ -133,6 +134,15 @@ class Bench:
         after = self._measured("rotation") - at
         self._api.command("reset")
         self._note("stop in motion", ok=abs(after) < 5.0, stood_s=round(stood_s, 3), further_deg=round(after, 3))
+
+    def _attempt(self, name: str, motion: Callable[[], None]) -> None:
+        """One motion; what the machine refuses or does not do in time is that motion's result, and it is stopped."""
+        try:
+            motion()
+        except (Refused, WaitError) as why:
+            self._api.stop()
+            self._api.command("reset")
+            self._note(name, ok=False, why=str(why))
 
     def _arm(self) -> None:
         self._api.command("arm")

@@ -59,6 +59,19 @@ def newest_package() -> Path:
     return found[-1]
 
 
+def unpacked(package: Path) -> Path:
+    """The folder with what is in ``package``; made where there is none yet or the package is newer."""
+    place = RESULTS / "cache" / "package"
+    stamp, origin = place.with_suffix(".made-of"), f"{package.name} {package.stat().st_mtime_ns}\n"
+    if not stamp.exists() or stamp.read_text(encoding="utf-8") != origin:
+        stamp.unlink(missing_ok=True)
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        subprocess.run(["dpkg-deb", "--extract", package, place], check=True)
+        stamp.write_text(origin, encoding="utf-8")
+    return place
+
+
 def can_run_here() -> str:
     """Empty where the suite can run on this machine itself, else why not."""
     if os.geteuid() != 0:
@@ -72,9 +85,9 @@ def can_run_here() -> str:
     return "" if can_make_vcan() else "the kernel makes no vcan"
 
 
-def in_guest(part: Part, package: Path, *, follow: bool) -> int:
+def in_guest(part: Part, package: Path, tree: Path, *, follow: bool) -> int:
     """Run one part in a guest; its log, journal and console stay under var/hil/PART."""
-    command = (str(PYTHON), "-m", "hil.suite", part.suite, str(package))
+    command = (str(PYTHON), "-m", "hil.suite", part.suite, str(package), str(tree))
     out = RESULTS / part.name
     shutil.rmtree(out, ignore_errors=True)
     status = uml.Guest(command, out, directory=PROJECT, timeout_s=part.timeout_s, place_n=part.place_n).run(
@@ -101,9 +114,10 @@ def in_guests(package: Path, part: str, soak_s: float) -> list[int]:
     """Suite and soak in two guests side by side; the soak's log is printed after the suite's."""
     suite = Part("suite", "all-and-shutdown", 900.0, 0)
     soak = Part("soak", "soak", soak_s + 420.0, 1)
+    tree = unpacked(package)
     with ThreadPoolExecutor(max_workers=2, thread_name_prefix="guest") as pool:
-        beside = pool.submit(in_guest, soak, package, follow=part == "soak") if part != "suite" else None
-        results = [in_guest(suite, package, follow=True), judge_shutdown()] if part != "soak" else []
+        beside = pool.submit(in_guest, soak, package, tree, follow=part == "soak") if part != "suite" else None
+        results = [in_guest(suite, package, tree, follow=True), judge_shutdown()] if part != "soak" else []
         if beside is not None:
             results.append(beside.result())
             if part == "both":

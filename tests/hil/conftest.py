@@ -32,7 +32,7 @@ DROP_IN = Path("/etc/systemd/system/graderd.service.d")
 # 0.2 s longer patience where the whole guest may stand still for that long.
 FOR_THE_GUEST: dict[str, object] = {
     "rotation.poll_hz": 25.0,
-    "rotation.velocity_deg_per_s": 6.0,  # so that a test can look while it turns
+    "rotation.velocity_deg_per_s": 9.0,  # so that a test can look while it turns
     "rotation.watchdog_s": 0.4,
     "rotation.goal_timeout_s": 0.4,
     "rotation.reply_timeout_s": 0.5,
@@ -50,6 +50,14 @@ FOR_THE_GUEST: dict[str, object] = {
     "perception.decision.max_frame_age_s": 0.5,
     "perception.decision.max_angle_age_s": 0.5,
     "rule.vote_max_age_s": 4.0,
+}
+
+# What the tests of the bus ask for beside the interface: a stop message, and to move where somebody says.
+STOP_PGN = 0xFF77
+ON_THE_BUS: dict[str, object] = {
+    "can.channel": CAN,
+    "can.stop_pgn_n": STOP_PGN,
+    "can.obey_commanded_address": True,
 }
 
 
@@ -117,7 +125,7 @@ def service(request: pytest.FixtureRequest, rig: Rig) -> Iterator[Grader]:
         encoding="utf-8",
     )
     grader = Grader()
-    grader.start_with(rig.configuration() | FOR_THE_GUEST | {"can.channel": CAN})
+    grader.start_with(rig.configuration() | FOR_THE_GUEST | ON_THE_BUS)
     before = _descriptors(grader)
     yield grader
     after = _descriptors(grader) if grader.unit.pid else {}

@@ -7,10 +7,9 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
-import pytest
-
 from hil.bus import ADDRESS_CLAIMED, KernelNode, RawBus
 from hil.service import Grader, Rig, faults, run, wait_for
+from tests.hil.conftest import STOP_PGN
 
 WIRE = "wire0"
 OURS = 0xE7
@@ -20,7 +19,6 @@ COMPONENT_ID = 65259
 SOFTWARE_ID = 65242
 COMMANDED_ADDRESS = 65240
 ACKNOWLEDGE = 0xE800
-STOP_PGN = 0xFF77
 # Identity 2, arbitrary address capable, otherwise zero: below any NAME the daemon has by default.
 LOW_NAME = 0x8000_0000_0000_0002
 HIGH_NAME = 0xF000_0000_0000_0002
@@ -173,17 +171,7 @@ def test_a_claiming_daemon_of_can_utils_lives_beside_it(ready: Grader, listener:
     assert not faults(ready.api.status()) - {"can.address_conflict"}
 
 
-@pytest.fixture
-def with_stop_message(service: Grader, ready: Grader) -> Iterator[Grader]:
-    """The service with a stop PGN of our choice that obeys a commanded address."""
-    service.configure({"can.stop_pgn_n": STOP_PGN, "can.obey_commanded_address": True})
-    service.start()
-    yield service
-    service.configure({"can.obey_commanded_address": False})
-
-
-def test_a_stop_message_stops_and_a_commanded_address_is_taken(with_stop_message: Grader, listener: RawBus) -> None:
-    grader = with_stop_message
+def test_a_stop_message_stops_and_a_commanded_address_is_taken(ready: Grader, listener: RawBus) -> None:
     with node(0x80) as peer:
         listener.drain()
         peer.request(ADDRESS_CLAIMED)
@@ -193,7 +181,7 @@ def test_a_stop_message_stops_and_a_commanded_address_is_taken(with_stop_message
         assert our_claim(listener, 5.0)[0] == 0xC1
         listener.drain()
         assert control_sources(listener, 0.5) == {0xC1}
-    grader.arm("manual")
+    ready.arm("manual")
     run("cansend", WIRE, f"18{STOP_PGN:04X}80#0000000000000000")
-    state = grader.wait("stopped by the bus", lambda s: s["mode"] == "stopped", 2.0)
+    state = ready.wait("stopped by the bus", lambda s: s["mode"] == "stopped", 2.0)
     assert "PGN" in state["reason"] or "stop" in state["reason"]
