@@ -24,7 +24,7 @@ class LiftPairSettings(Settings):
     """How closely the sides are kept together."""
 
     full_speed_mm_per_s: Positive = Field(50.0, description="guess of a lift's speed at speed share 1, until learned")
-    first_share: Positive = Field(0.38, le=1.0, description="speed share while a side's speed is still unknown")
+    first_share: Positive = Field(0.37, le=1.0, description="speed share while a side's speed is still unknown")
     min_share: Positive = Field(0.32, le=1.0, description="slowest speed share at which a lift moves well")
     catch_up_hz: Positive = Field(4.0, description="how much slower the side ahead goes, mm/s for each mm")
     wait_mm: Positive = Field(2.85, description="the side ahead stops from here on until the other has come up")
@@ -72,6 +72,8 @@ _MIN_DRIVE_S: Final = 0.01
 _KNOWN_DRIVE_S: Final = 0.05
 _KNOWN_MM: Final = 1.5
 """A gain counts as known after this much movement."""
+_HINT_DRIVE_S: Final = 0.05
+"""What is known of the other direction weighs as much as so much movement in this one, until that is seen."""
 _FORGET: Final = 0.85
 _NEAR_MM: Final = 8.0
 """Lifts slow down by themselves this close to their target: nothing is learned there."""
@@ -170,7 +172,8 @@ class _Side:
         near = abs(self.target_mm - self.position_mm) < _NEAR_MM or abs(self.way_mm) < _WAY_MM
         if drive_s < _MIN_DRIVE_S or near or moved_mm < 0.0:
             return
-        old_mm, old_s = self.learned.get(self.direction, (0.0, 0.0))
+        hint = self.hint_mm_per_s or 0.0
+        old_mm, old_s = self.learned.get(self.direction, (hint * _HINT_DRIVE_S, _HINT_DRIVE_S if hint else 0.0))
         self.learned[self.direction] = (_FORGET * old_mm + moved_mm, _FORGET * old_s + drive_s)
 
 

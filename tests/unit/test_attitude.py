@@ -218,7 +218,7 @@ async def alone(machine: Machine, loop: SimulatedLoop, name: str, target_mm: flo
         *itertools.product(("lift_left", "lift_right"), (0.0, 800.0), (1, 2)),
         # here the first messages of a move fell so that its start-up was taken for a slow side
         ("lift_left", 400.0, 16), ("lift_left", 800.0, 4), ("lift_left", 800.0, 23),
-        ("lift_right", 0.0, 27), ("lift_right", 0.0, 36), ("lift_right", 400.0, 22),
+        ("lift_right", 0.0, 27), ("lift_right", 0.0, 36), ("lift_right", 400.0, 22), ("lift_left", 0.0, 51),
     ],
 )  # fmt: skip
 def test_a_100_mm_lift_with_one_side_30_percent_slower(slow: str, load_n: float, seed: int) -> None:
