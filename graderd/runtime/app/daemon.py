@@ -129,10 +129,10 @@ class Daemon:
         answering = asyncio.Event()
         try:
             async with asyncio.TaskGroup() as group:
-                tasks = [group.create_task(self._serve(answering), name="api")]
+                api = group.create_task(self._serve(answering), name="api")
                 # A second daemon learns here that the socket is taken: before it touches a device.
                 await answering.wait()
-                tasks += [
+                tasks = [
                     group.create_task(self._loop.run(), name="control-tick"),
                     group.create_task(self._eyes.run(), name="perception"),
                     group.create_task(open_devices(self._loop), name="open-devices"),
@@ -146,6 +146,8 @@ class Daemon:
                 self._notifier.ready("disarmed")
                 log.info("ready on %s, disarmed", self._config.api.socket)
                 await self._ended.wait()
+                # First: who sends thousands of requests a second must not have the time that the devices need.
+                api.cancel()
                 await self._close_devices()
                 for task in tasks:
                     task.cancel()
