@@ -18,7 +18,8 @@ HEAD = """\
 The daemon as a process against the simulated grader, which speaks the real wires: each fault below is injected while
 the machine stands armed (idle), while automatic operation turns the blade (turning), and while a preset moves both
 lifts, rotation and tilt together (coordinated lift). `make faults` runs it all, `make faults ARGS="--short --json"`
-the part that the tests run; `tests/fault/campaign` is the code.
+the part that the tests run; a long run may be taken in parts (`--part 1/2 --output FILE`, at the end `--of FILE FILE`
+for this page). `tests/fault/campaign` is the code.
 
 What must happen is derived from the [fault catalogue](../operators/faults.md): reaction, axes held, and what ends the
 fault. What did happen is measured on the virtual devices themselves:
