@@ -1,8 +1,7 @@
 """The perception child that lies when ``$GRADERD_CAMPAIGN_LIE`` names a file that says so; else it is the real one.
 
-The file: ``{"line": "..."}`` sends that line once in place of an observation (nonsense on the wire),
-``{"fields": {...}}`` overwrites fields of every observation, ``{"memory_error": true}`` is what Python does without
-memory.
+The file: ``{"line": "..."}`` sends that line in place of every observation (nonsense on the wire), ``{"fields": {...}}``
+overwrites fields of every observation.
 """
 
 from __future__ import annotations
@@ -25,8 +24,6 @@ class LyingWorker(product.Worker):
         lie = Path(os.environ["GRADERD_CAMPAIGN_LIE"])
         if isinstance(message, Observed) and lie.exists():
             wanted = json.loads(lie.read_text(encoding="utf-8"))
-            if "memory_error" in wanted:
-                raise MemoryError
             if "line" in wanted:
                 self._out.write(wanted["line"].encode() + b"\n")
                 self._out.flush()
