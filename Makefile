@@ -48,6 +48,7 @@ soak: $(STAMP) ## the soak alone, SOAK_S seconds of it
 
 hil-package: $(STAMP) ## install, use, upgrade, purge the package in a clean Debian root (not in every CI run)
 	@hil/setup --usb
+	@$(MAKE) --no-print-directory deb
 	@PYTHONPATH=. $(BIN)/python -m hil.package $(HIL_ARGS)
 
 hil-usb: $(STAMP) ## QEMU: an FTDI adapter pulled and plugged, two SJA1000 controllers (before a release; 5 minutes or so)

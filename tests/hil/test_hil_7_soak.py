@@ -11,13 +11,15 @@ from pathlib import Path
 import pytest
 
 from hil import bus
-from hil.service import Grader, Rig, Unit, brief, faults, new_pass
+from hil.service import Grader, Rig, Status, Unit, brief, faults, new_pass
 
 SOAK_S = float(os.environ.get("GRADERD_SOAK_S", "120"))
 SEED = int(os.environ.get("GRADERD_HIL_SEED", "0"))
 ANGLES = {"left": 30.0, "center": 15.0, "right": -30.0, "even": 45.0}
 CAN = "vcan0"
 GROWTH_MIB = 24.0
+FRESH_S = 1.5
+SETTLED_S = 2.0
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(SOAK_S + 300.0)]
 
@@ -72,9 +74,24 @@ class Soak:
         self.grader.api.stop()
         self.grader.wait("stopped", lambda s: s["mode"] == "stopped", 3.0)
 
+    def settled(self) -> Status:
+        """Wait until pictures come and neither mode nor faults have changed for a while: some faults show late."""
+        seen: tuple[str, set[str]] | None = None
+        since_s = 0.0
+
+        def unchanged(status: Status) -> bool:
+            nonlocal seen, since_s
+            now = (status["mode"], faults(status))
+            if now != seen:
+                seen, since_s = now, time.monotonic()
+            pictures = status["soil"]["age_s"] is not None and status["soil"]["age_s"] < FRESH_S
+            return pictures and time.monotonic() - since_s >= SETTLED_S
+
+        return self.grader.wait("settled", unchanged, 40.0)
+
     def recover(self) -> None:
         """What an operator does: wait until it is ready, arm, automatic."""
-        state = self.grader.wait("an answer", lambda s: s["mode"], 10.0)
+        state = self.settled()
         if state["mode"] == "stopped":
             self.grader.api.command("reset")
             state = self.grader.wait("reset", lambda s: s["mode"] == "disarmed", 5.0)
