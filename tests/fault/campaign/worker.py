@@ -1,7 +1,7 @@
 """The perception child that lies when ``$GRADERD_CAMPAIGN_LIE`` names a file that says so; else it is the real one.
 
-The file: ``{"line": "..."}`` sends that line in place of every observation (nonsense on the wire), ``{"fields": {...}}``
-overwrites fields of every observation.
+The file: ``{"line": "..."}`` sends that line in place of every observation (nonsense on the wire),
+``{"fields": {...}}`` overwrites fields of every observation.
 """
 
 from __future__ import annotations
