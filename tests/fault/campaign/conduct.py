@@ -214,7 +214,7 @@ async def detect(stack: Stack, case: Case, outcome: Outcome, from_s: float) -> N
         if status is not None and named and status["time_s"] >= from_s:
             outcome.detected, outcome.named = True, named[0]["name"]
             outcome.detection_s = max(0.0, status["time_s"] - from_s)
-            outcome.message = f"{named[0]['reads']} ({named[0]['detail']})"
+            outcome.message = f"{named[0]['reads']} ({named[0]['detail']})".replace(str(stack.directory), "RIG")
             if outcome.detection_s > case.detect_s + SLACK_S:
                 outcome.problems.append(f"detected after {outcome.detection_s:.2f} s, {case.detect_s:g} s promised")
             return
