@@ -1,8 +1,9 @@
 """The whole hardware-in-the-loop run: ``make hil``.
 
 Where the running kernel makes a vcan, root runs, systemd is the first process and no graderd is installed, the suite
-runs here. Elsewhere it runs in user-mode Linux guests of this machine's own files: the suite with the shutdown in one,
-the soak beside it in another. The same tests either way; only the shutdown needs a computer that may be shut down.
+runs here. Elsewhere it runs in user-mode Linux guests of this machine's own files: the work with the shutdown in one,
+life cycle and soak beside it in another. The same tests either way; only the shutdown needs a computer that may be shut
+down.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from hil import uml
 from hil.shutdown import judge
+from hil.suite import PARTS
 
 PROJECT = Path(__file__).resolve().parent.parent
 PYTHON = PROJECT / ".venv" / "bin" / "python"
@@ -27,10 +30,9 @@ RESULTS = PROJECT / "var" / "hil"
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A part of the run in a guest of its own."""
+    """A part of the run in a guest of its own; its name is one of :data:`hil.suite.PARTS`."""
 
     name: str
-    suite: str
     timeout_s: float
     place_n: int
 
@@ -87,7 +89,7 @@ def can_run_here() -> str:
 
 def in_guest(part: Part, package: Path, tree: Path, *, follow: bool) -> int:
     """Run one part in a guest; its log, journal and console stay under var/hil/PART."""
-    command = (str(PYTHON), "-m", "hil.suite", part.suite, str(package), str(tree))
+    command = (str(PYTHON), "-m", "hil.suite", part.name, str(package), str(tree))
     out = RESULTS / part.name
     shutil.rmtree(out, ignore_errors=True)
     status = uml.Guest(command, out, directory=PROJECT, timeout_s=part.timeout_s, place_n=part.place_n).run(
@@ -100,43 +102,43 @@ def in_guest(part: Part, package: Path, tree: Path, *, follow: bool) -> int:
     return status
 
 
-def judge_shutdown() -> int:
-    """The verdict on the shutdown that followed the suite; 0 where the machine was brought to a stand."""
-    if not (RESULTS / "suite" / "graceful").exists():
+def judge_shutdown(part: Part) -> int:
+    """The verdict on the shutdown that followed a part; 0 where the machine was brought to a stand."""
+    out = RESULTS / part.name
+    if not (out / "graceful").exists():
         sys.stdout.write("hil: shutdown: not tried, for its test did not run to its end\n")
-        return 0  # The suite's own status tells of a test that failed.
-    wrong = judge(RESULTS / "suite" / "shutdown.log")
+        return 0  # The part's own status tells of a test that failed.
+    wrong = judge(out / "shutdown.log")
     sys.stdout.write("".join(f"hil: shutdown: {line}\n" for line in wrong or ["the blade stood, motion was disabled"]))
     return 1 if wrong else 0
 
 
-def in_guests(package: Path, part: str, soak_s: float) -> list[int]:
-    """Suite and soak in two guests side by side; the soak's log is printed after the suite's."""
-    suite = Part("suite", "all-and-shutdown", 900.0, 0)
-    soak = Part("soak", "soak", soak_s + 420.0, 1)
+def in_guests(package: Path, wanted: str, soak_s: float) -> list[int]:
+    """The parts in two guests, side by side where there are two processors; the second's log after the first's."""
+    work = Part("work", 900.0, 0)
+    endurance = Part("soak" if wanted == "soak" else "endurance", soak_s + 600.0, 1)
     tree = unpacked(package)
-    with ThreadPoolExecutor(max_workers=2, thread_name_prefix="guest") as pool:
-        beside = pool.submit(in_guest, soak, package, tree, follow=part == "soak") if part != "suite" else None
-        results = [in_guest(suite, package, tree, follow=True), judge_shutdown()] if part != "soak" else []
-        if beside is not None:
-            results.append(beside.result())
-            if part == "both":
-                sys.stdout.write((RESULTS / soak.name / "log").read_text(encoding="utf-8", errors="replace"))
+    if wanted in ("soak", "endurance"):
+        return [in_guest(endurance, package, tree, follow=True)]
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="guest") as pool:
+        run_second = partial(in_guest, endurance, package, tree, follow=False)
+        beside = pool.submit(run_second) if wanted == "all" and len(os.sched_getaffinity(0)) > 1 else None
+        results = [in_guest(work, package, tree, follow=True), judge_shutdown(work)]
+        if wanted == "all":
+            results.append(beside.result() if beside else run_second())
+            sys.stdout.write((RESULTS / endurance.name / "log").read_text(encoding="utf-8", errors="replace"))
     return results
 
 
-def on_this_machine(package: Path, part: str) -> list[int]:
-    """The same without a guest, one after the other; the machine is not shut down."""
-    wanted = {"suite": ["all"], "soak": ["soak"], "both": ["all", "soak"]}[part]
-    return [
-        subprocess.run([PYTHON, "-m", "hil.suite", name, package], cwd=PROJECT, check=False).returncode
-        for name in wanted
-    ]
+def on_this_machine(package: Path, wanted: str) -> list[int]:
+    """The same without a guest; the machine is not shut down."""
+    command = [str(PYTHON), "-m", "hil.suite", wanted, str(package)]
+    return [subprocess.run(command, cwd=PROJECT, check=False).returncode]
 
 
 def keep_failed(number: int) -> None:
     """Put the results of a run that failed where the next one does not overwrite them."""
-    for part in ("suite", "soak"):
+    for part in PARTS:
         if (RESULTS / part).exists():
             kept = RESULTS / f"failed-{number}" / part
             shutil.rmtree(kept, ignore_errors=True)
@@ -146,7 +148,7 @@ def keep_failed(number: int) -> None:
 def main() -> int:
     """Command line; 0 where every run passed."""
     parser = argparse.ArgumentParser(prog="make hil", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--part", choices=["suite", "soak", "both"], default="both")
+    parser.add_argument("--part", choices=PARTS, default="all", help="endurance: life cycle and soak; work: the rest")
     parser.add_argument("--soak-s", type=float, default=120.0, help="length of the soak in seconds")
     parser.add_argument("--guest", action="store_true", help="in a guest even where it could run here")
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="so many runs in a row, all of them")

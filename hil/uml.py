@@ -98,7 +98,7 @@ class Guest:
             f"{shlex.join(self.command)}\n"
             'echo $? > "$HIL_OUT/exit.new" && mv "$HIL_OUT/exit.new" "$HIL_OUT/exit"\n'
             "# A command that wants the ordinary, ordered shutdown leaves this file; hil-journal.service follows it.\n"
-            'if [ -e "$HIL_OUT/graceful" ]; then systemctl poweroff --no-block; exit; fi\n'
+            'if [ -e "$HIL_OUT/graceful" ]; then systemctl --no-block start poweroff.target; exit; fi\n'
             "systemctl stop hil-journal.service\n"
             "systemctl poweroff --force\n"
         )

@@ -17,7 +17,7 @@ FURTHER_DEG = 10.0
 CAN = "vcan0"
 ACM = 0xEF00
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.endurance, pytest.mark.timeout(240)]
 
 
 def angle(rig: Rig) -> float:

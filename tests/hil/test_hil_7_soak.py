@@ -21,7 +21,7 @@ GROWTH_MIB = 24.0
 FRESH_S = 1.5
 SETTLED_S = 2.0
 
-pytestmark = [pytest.mark.soak, pytest.mark.timeout(SOAK_S + 300.0)]
+pytestmark = [pytest.mark.endurance, pytest.mark.soak, pytest.mark.timeout(SOAK_S + 300.0)]
 
 
 class Soak:
