@@ -81,7 +81,8 @@ def read_live(channel: str) -> Iterator[Timed]:
     port = open_port(settings)
     try:
         while True:
-            select.select([port.fileno()], [], [])
+            if not port.pending:
+                select.select([port.fileno()], [], [])
             for item in port.read():
                 if not isinstance(item, BusEvent):
                     yield clock.now_s(), item

@@ -261,6 +261,8 @@ class CanLink:
                 self._on_frame(item, now_s)
         self.counters.rx_n += len(items)
         self._health.on_traffic(len(items), now_s)
+        if port.pending:
+            asyncio.get_running_loop().call_soon(self._on_readable)
         if self._node.outbox:
             self._flush()
 

@@ -31,8 +31,9 @@ _SYS_NET: Final = Path("/sys/class/net")
 _IFF_UP: Final = 1
 _SO_RXQ_OVFL: Final = 40
 _BRIDGE_N: Final = 4000
-_READ_N: Final = 64
-"""Frames taken in one go, so that a flood cannot keep the event loop."""
+_READ_N: Final = 8
+"""Frames taken in one go: a quarter of a millisecond. A flood, or what piled up in a slow adapter, keeps neither the
+event loop nor the next control message waiting."""
 
 LostCondition = Literal["interface_down", "unplugged"]
 
@@ -79,7 +80,7 @@ class BusPort:
         return self._fd
 
     def read(self) -> list[Frame | BusEvent]:
-        """Up to 64 frames and events that wait, without blocking.
+        """Some of the frames and events that wait, without blocking; see :attr:`pending`.
 
         Raises:
             PortLostError: the interface or adapter is gone.
@@ -101,6 +102,11 @@ class BusPort:
         except ValueError:
             pass  # a garbled line of a serial adapter: that frame is lost
         return out
+
+    @property
+    def pending(self) -> bool:
+        """Whether something is left that does not make the descriptor readable."""
+        return False
 
     def send(self, frame: Frame) -> None:
         """Send one frame without blocking.
@@ -198,6 +204,11 @@ class SlcanPort(BusPort):
         while self._slcan.events:
             out.append(self._slcan.events.popleft())
         return out
+
+    @property
+    def pending(self) -> bool:
+        """Whether lines are left that were read from the port already."""
+        return self._slcan.pending
 
     def _more(self) -> bool:
         return self._slcan.pending or super()._more()

@@ -17,7 +17,7 @@ import pytest
 from drivers.electrak import CanLink, ElectrakActuator, dump
 from drivers.electrak.bus_events import BusEvent, event_of
 from drivers.electrak.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
-from drivers.electrak.ports import PortLostError, SocketCanPort, lost_from
+from drivers.electrak.ports import PortLostError, SlcanPort, SocketCanPort, lost_from
 from drivers.electrak.slcan_bus import QuietSlcanBus
 from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
 from graderd.hal.lifecycle import Lifecycle
@@ -415,4 +415,31 @@ async def test_a_host_that_does_not_read_loses_whole_frames_and_never_half_of_on
     assert len(seen) > 50
     assert seen == sorted(set(seen))
     host.shutdown()
+    await bus.close()
+
+
+async def test_what_piled_up_is_read_in_small_helpings_and_to_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A backlog must not keep the next control message waiting, and must not wait for another frame to come."""
+    bus = VirtualActuatorBus([], link=tmp_path / "can")
+    await bus.start()
+    link = CanLink(CanSettings(interface="slcan", channel=str(tmp_path / "can")))
+    await link.open()
+    seen: list[int] = []
+    link.tap(lambda frame, _: seen.append(frame.can_id))
+    helpings: list[int] = []
+    read = SlcanPort.read
+
+    def counted(port: SlcanPort) -> list[Frame | BusEvent]:
+        items = read(port)
+        helpings.append(len(items))
+        return items
+
+    monkeypatch.setattr(SlcanPort, "read", counted)
+    for index in range(60):
+        bus.send(Frame(make_id(6, 0xFF00, index), b"12345678"))
+    await until(lambda: len([i for i in seen if pgn_of(i) == 0xFF00]) == 60)
+    assert max(helpings) <= 8
+    await link.close()
     await bus.close()
