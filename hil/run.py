@@ -1,9 +1,9 @@
 """The whole hardware-in-the-loop run: ``make hil``.
 
 Where the running kernel makes a vcan, root runs, systemd is the first process and no graderd is installed, the suite
-runs here. Elsewhere it runs in user-mode Linux guests of this machine's own files: the work with the shutdown in one,
-life cycle and soak beside it in another. The same tests either way; only the shutdown needs a computer that may be shut
-down.
+runs here. Elsewhere it runs in two user-mode Linux guests of this machine's own files, side by side: crashes and the soak
+in one, the rest with the shutdown in the other. The same tests either way; only the shutdown needs a computer that may be
+shut down.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def keep_failed(number: int) -> None:
 def main() -> int:
     """Command line; 0 where every run passed."""
     parser = argparse.ArgumentParser(prog="make hil", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--part", choices=PARTS, default="all", help="endurance: life cycle and soak; work: the rest")
+    parser.add_argument("--part", choices=PARTS, default="all", help="endurance: crashes and the soak; work: the rest")
     parser.add_argument("--soak-s", type=float, default=120.0, help="length of the soak in seconds")
     parser.add_argument("--guest", action="store_true", help="in a guest even where it could run here")
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="so many runs in a row, all of them")

@@ -17,7 +17,7 @@ FURTHER_DEG = 10.0
 CAN = "vcan0"
 ACM = 0xEF00
 
-pytestmark = [pytest.mark.endurance, pytest.mark.timeout(240)]
+pytestmark = pytest.mark.timeout(240)
 
 
 def angle(rig: Rig) -> float:
@@ -50,6 +50,7 @@ def back_disarmed(grader: Grader, old_pid: int, timeout_s: float) -> None:
     grader.wait_ready()
 
 
+@pytest.mark.endurance
 @pytest.mark.restarts(1)
 def test_a_frozen_daemon_is_replaced_and_the_blade_stands(ready: Grader, rig: Rig, listener: RawBus) -> None:
     turn(ready, rig)
@@ -69,6 +70,7 @@ def test_a_frozen_daemon_is_replaced_and_the_blade_stands(ready: Grader, rig: Ri
     assert ready.api.status()["mode"] == "disarmed"
 
 
+@pytest.mark.endurance
 @pytest.mark.restarts(1)
 def test_a_killed_daemon_is_replaced_and_the_guard_speaks(ready: Grader, rig: Rig, listener: RawBus) -> None:
     turn(ready, rig)
