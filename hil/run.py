@@ -1,9 +1,9 @@
 """The whole hardware-in-the-loop run: ``make hil``.
 
 Where the running kernel makes a vcan, root runs, systemd is the first process and no graderd is installed, the suite
-runs here. Elsewhere it runs in two user-mode Linux guests of this machine's own files, side by side: crashes and the soak
-in one, the rest with the shutdown in the other. The same tests either way; only the shutdown needs a computer that may be
-shut down.
+runs here. Elsewhere it runs in two user-mode Linux guests of this machine's own files, side by side: crashes and the
+soak in one, the rest with the shutdown in the other. The same tests either way; only the shutdown needs a computer that
+may be shut down.
 """
 
 from __future__ import annotations
