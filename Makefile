@@ -38,12 +38,12 @@ deb: $(STAMP) ## build dist/graderd_VERSION_ARCH.deb (DEB_ARGS="--arch arm64"); 
 
 hil: $(STAMP) ## hardware in the loop on a real kernel CAN stack (installs Debian packages once, as root)
 	@hil/setup
-	@$(MAKE) --no-print-directory deb
+	@$(BIN)/python packaging/build_deb.py --system-python --out var/hil/dist
 	@PYTHONPATH=. $(BIN)/python -m hil.run $(HIL_ARGS)
 
 soak: $(STAMP) ## the soak alone, SOAK_S seconds of it
 	@hil/setup
-	@$(MAKE) --no-print-directory deb
+	@$(BIN)/python packaging/build_deb.py --system-python --out var/hil/dist
 	@PYTHONPATH=. $(BIN)/python -m hil.run --part soak --soak-s $(SOAK_S)
 
 hil-package: $(STAMP) ## install, use, upgrade, purge the package in a clean Debian root (not in every CI run)

@@ -48,16 +48,16 @@ class Verdict:
         return f"{'passed' if not self.status else 'FAILED'} in {self.took_s:.0f} s"
 
 
-def newest_package() -> Path:
-    """The package ``make deb`` built last.
+def newest_package(folder: Path = PROJECT / "dist") -> Path:
+    """The package built last.
 
     Raises:
         SystemExit: there is none.
     """
     architecture = subprocess.run(["dpkg", "--print-architecture"], capture_output=True, text=True, check=True).stdout
-    found = sorted((PROJECT / "dist").glob(f"graderd_*_{architecture.strip()}.deb"), key=lambda p: p.stat().st_mtime)
+    found = sorted(folder.glob(f"graderd_*_{architecture.strip()}.deb"), key=lambda p: p.stat().st_mtime)
     if not found:
-        raise SystemExit("hil: no package in dist/. Build it first: make deb")
+        raise SystemExit(f"hil: no package in {folder}. Build it first: make deb, or make hil")
     return found[-1]
 
 
@@ -160,7 +160,7 @@ def main() -> int:
         problem = uml.cannot() if why else ""
         sys.stderr.write(f"hil: cannot run here: {why}; {problem}\n" if problem else "")
         return uml.GUEST_DIED if problem else 0
-    package = newest_package()
+    package = newest_package(RESULTS / "dist")
     sys.stdout.write(f"hil: in user-mode Linux ({why})\n" if why else "hil: on this machine's own kernel\n")
     sys.stdout.flush()
     verdicts: list[Verdict] = []

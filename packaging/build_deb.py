@@ -72,10 +72,11 @@ sys.exit({function}())
 
 @dataclass(frozen=True, slots=True)
 class Package:
-    """What is to be built and the tree it is built in."""
+    """What is to be built, for which Pythons, and the tree it is built in."""
 
     version: str
     architecture: str
+    pythons: tuple[str, ...]
     tree: Path
 
     @property
@@ -127,9 +128,9 @@ def wheels_for(package: Package, scratch: Path) -> dict[str, list[Path]]:
     site = [Path(entry) for entry in sys.path if entry.endswith("site-packages")]
     pins = read_lock(PROJECT / "requirements.lock")
     wanted = roots(PROJECT / "pyproject.toml", EXTRAS)
-    targets = {python: Target(python, package.machine) for python in PYTHONS}
+    targets = {python: Target(python, package.machine) for python in package.pythons}
     chosen = {python: select(pins, wanted, site, target) for python, target in targets.items()}
-    first, *others = PYTHONS
+    first, *others = package.pythons
     found = {first: download(targets[first], chosen[first], scratch)}
     # What serves every Python is fetched once.
     shared = {project_of(wheel): wheel for wheel in found[first] if serves_all(wheel, first)}
@@ -274,12 +275,16 @@ def write_control(package: Package) -> None:
     folder.mkdir()
     files = [path for path in package.tree.rglob("*") if path.is_file() and not path.is_symlink()]
     size_kib = sum(path.stat().st_size for path in files) // 1024
-    above = f"3.{int(PYTHONS[-1].split('.')[1]) + 1}"
+    above = f"3.{int(package.pythons[-1].split('.')[1]) + 1}"
     control = (
         (DEBIAN / "control")
         .read_text(encoding="utf-8")
         .format(
-            version=package.version, architecture=package.architecture, size_kib=size_kib, first=PYTHONS[0], above=above
+            version=package.version,
+            architecture=package.architecture,
+            size_kib=size_kib,
+            first=package.pythons[0],
+            above=above,
         )
     )
     (folder / "control").write_text(control, encoding="utf-8")
@@ -293,12 +298,25 @@ def write_control(package: Package) -> None:
     (folder / "md5sums").write_text("".join(sums), encoding="utf-8")
 
 
-def build(version: str, architecture: str, folder: Path) -> Path:
+def system_python() -> str:
+    """The version of this machine's own Python.
+
+    Raises:
+        SystemExit: it is none of those the package supports.
+    """
+    version = "import sys; print('%d.%d' % sys.version_info[:2])"
+    own = subprocess.run(["/usr/bin/python3", "-c", version], capture_output=True, text=True, check=True).stdout.strip()
+    if own not in PYTHONS:
+        raise SystemExit(f"build_deb: /usr/bin/python3 is {own}; the package supports {', '.join(PYTHONS)}")
+    return own
+
+
+def build(version: str, architecture: str, pythons: tuple[str, ...], folder: Path) -> Path:
     """Build the package into ``folder``; returns its path."""
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="graderd-deb-") as temporary:
         scratch = Path(temporary)
-        package = Package(version, architecture, scratch / "tree")
+        package = Package(version, architecture, pythons, scratch / "tree")
         package.tree.mkdir(mode=0o755)
         os.umask(0o022)
         make_environment(package, wheels_for(package, scratch), our_wheel(package, scratch))
@@ -320,8 +338,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--arch", choices=sorted(MACHINES), default=native)
     parser.add_argument("--version", default=project["version"])
     parser.add_argument("--out", type=Path, default=PROJECT / "dist")
+    parser.add_argument("--system-python", action="store_true", help="for this machine's Python only, for tests on it")
     options = parser.parse_args(arguments)
-    result = build(options.version, options.arch, options.out)
+    pythons = (system_python(),) if options.system_python else PYTHONS
+    result = build(options.version, options.arch, pythons, options.out)
     sys.stdout.write(f"{result} ({result.stat().st_size / 1e6:.0f} MB)\n")
     return 0
 
