@@ -196,14 +196,11 @@ class Grader:
         raise WaitError(f"{what}: not within {timeout_s:g} s; {brief(last)}\n{self.unit.journal(25)}")
 
     def wait_ready(self, timeout_s: float = 40.0) -> Status:
-        """Wait until all four axes are in standby and the camera gives pictures."""
+        """Wait until all four axes are in standby and nothing mandatory keeps arming away."""
 
         def ready(status: Status) -> bool:
             axes = status["axes"].values()
-            return len(axes) == 4 and all(a["lifecycle"] == "standby" for a in axes) and seen(status)
-
-        def seen(status: Status) -> bool:
-            return status["soil"]["age_s"] is not None and not mandatory_unmet(status)
+            return len(axes) == 4 and all(a["lifecycle"] == "standby" for a in axes) and not mandatory_unmet(status)
 
         return self.wait("ready to arm", ready, timeout_s)
 
@@ -348,6 +345,7 @@ def new_pass(grader: Grader, rig: Rig, zone: str, seed: int) -> None:
         grader.api.command("manual")
     rig.ask("scene", zone="none")
     rig.ask("reset_vehicle")
+    grader.wait("pictures", lambda s: s["soil"]["age_s"] is not None)
     grader.jog("rotate", 0.0, lambda s: abs(s["axes"]["rotation"]["measured"]) <= 0.5)
     rig.ask("scene", zone=zone, seed=seed)
     grader.api.command("auto")

@@ -89,6 +89,7 @@ def test_a_killed_daemon_is_replaced_and_the_guard_speaks(ready: Grader, rig: Ri
     assert "guard" in log
 
 
+@pytest.mark.endurance
 def test_stop_and_start_by_hand(ready: Grader, rig: Rig) -> None:
     turn(ready, rig)
     began_deg, began_s = angle(rig), time.monotonic()

@@ -142,7 +142,6 @@ def resident_mib(unit: Unit) -> float:
 
 def test_soak(ready: Grader, rig: Rig) -> None:
     soak = Soak(ready, rig)
-    ready.arm("auto")
     soak.scene()
     pid, began_s = ready.unit.pid, time.monotonic()
     before_mib: float | None = None
