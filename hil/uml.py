@@ -37,9 +37,7 @@ PREFERENCE = -10
 MEMORY_MIB = 2048
 PASSED_ON = ("PYTEST_ARGS", "GRADERD_HIL_SEED", "GRADERD_SOAK_S", "TERM")
 
-
-class LaunchError(Exception):
-    """The guest cannot be started; the text says what to install or change."""
+_running: set[subprocess.Popen[bytes]] = set()
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +131,15 @@ def cannot() -> str:
 
 
 def end_in_order() -> None:
-    """Let SIGTERM unwind the main program, so that a terminated launcher still takes its guest away."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    """Let a launcher that is terminated or interrupted take every guest of its away, whichever thread waits for it."""
+
+    def end(number: int, _: object) -> None:
+        for guest in list(_running):
+            _take_away(guest)
+        sys.exit(128 + number)
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, end)
 
 
 def missing() -> list[str]:
@@ -193,13 +198,19 @@ def _guest_process(command: Sequence[str], output_fd: int, scratch: str) -> Iter
     process = subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=output_fd, stderr=output_fd, env=environment, start_new_session=True
     )
+    _running.add(process)
     _weigh(process.pid)
     try:
         yield process
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
+        _take_away(process)
         process.wait()
+        _running.discard(process)
+
+
+def _take_away(process: subprocess.Popen[bytes]) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
 
 
 def _weigh(pid: int) -> None:
