@@ -39,6 +39,12 @@ FOR_THE_GUEST: dict[str, object] = {
     "control.rotation_max_age_s": 0.4,
     "control.actuator_max_age_s": 0.6,
     "control.overrun_s": 0.3,
+    "lift_pair.reading_max_age_s": 0.6,
+    **{
+        f"{axis}.{name}": seconds
+        for axis in ("lift_left", "lift_right", "tilt")
+        for name, seconds in (("feedback_timeout_s", 0.6), ("target_timeout_s", 0.5))
+    },
     "camera.color_width_px": 640,
     "camera.color_height_px": 400,
     "camera.depth_width_px": 424,
