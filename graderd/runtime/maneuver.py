@@ -57,18 +57,17 @@ class Maneuver:
             DeviceRefusedError: beyond a limit, or another client is moving the blade.
             DeviceLostError: the machine left manual mode (stop, fault) under way.
         """
-        await self._obey(cmd.Jog(axis="rotate", value=angle_deg, client=CLIENT))
+        await self._jog(angle_deg)
         clock = asyncio.get_running_loop().time
         end_s = clock() + dwell_s
         renew_s = clock() + RENEW_S
         while clock() < end_s:
-            if self._loop.state.mode is not Mode.MANUAL:
-                raise DeviceLostError("maneuver", f"ended under way: {self._loop.state.reason}")
+            self._check_manual()
             if clock() >= renew_s:
                 renew_s = clock() + RENEW_S
                 if not (await self._loop.command(cmd.Renew(client=CLIENT))).accepted:
                     # A late renewal on a loaded machine: the blade held meanwhile; ask again.
-                    await self._obey(cmd.Jog(axis="rotate", value=angle_deg, client=CLIENT))
+                    await self._jog(angle_deg)
             if each is not None:
                 each()
             await asyncio.sleep(SAMPLE_S)
@@ -77,3 +76,14 @@ class Maneuver:
         reply = await self._loop.command(command)
         if not reply.accepted:
             raise DeviceRefusedError(reply.command, reply.message, reply.remedy)
+
+    async def _jog(self, angle_deg: float) -> None:
+        try:
+            await self._obey(cmd.Jog(axis="rotate", value=angle_deg, client=CLIENT))
+        except DeviceRefusedError:
+            self._check_manual()  # a stop between two commands is why the second one is refused: tell the stop
+            raise
+
+    def _check_manual(self) -> None:
+        if self._loop.state.mode is not Mode.MANUAL:
+            raise DeviceLostError("maneuver", f"ended under way: {self._loop.state.reason}")
