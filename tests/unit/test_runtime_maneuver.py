@@ -56,10 +56,15 @@ async def test_it_arms_turns_and_disarms(tmp_path: Path) -> None:
 
 
 async def test_stop_ends_it_under_way(tmp_path: Path) -> None:
-    async with running(tmp_path) as (_, loop):
-        asyncio.get_running_loop().call_later(1.0, loop.stop_now, cmd.Stop(reason="person near the blade"))
+    async with running(tmp_path) as (machine, loop):
+
+        def step_in() -> None:
+            if machine.rotation.position > 2.0:
+                loop.stop_now(cmd.Stop(reason="person near the blade"))
+
         with pytest.raises(DeviceLostError, match="person near the blade"):
-            await turn(loop, 40.0)
+            async with Maneuver(loop) as blade:
+                await blade.rotate_to(40.0, 30.0, step_in)
         assert loop.state.mode is Mode.STOPPED
 
 
