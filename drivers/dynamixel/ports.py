@@ -97,7 +97,7 @@ def set_low_latency(opened: serial.Serial) -> bool:
     """
     try:
         opened.set_low_latency_mode(True)
-    except (ValueError, OSError, NotImplementedError):
+    except (ValueError, OSError, NotImplementedError):  # the last is pyserial's word on systems that have no such mode
         return False
     return True
 

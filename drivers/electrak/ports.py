@@ -69,7 +69,7 @@ class BusPort:
         self._bridge: _Bridge | None = None
         try:
             self._fd = bus.fileno()
-        except NotImplementedError:
+        except NotImplementedError:  # python-can's word for a bus without a descriptor
             self._fd = -1
         if self._fd < 0:
             self._bridge = _Bridge(bus)

@@ -71,8 +71,6 @@ class Decoder:
 class Playback(Protocol):
     """A recording being played."""
 
-    torn_dropped_n: int
-
     def next(self, timeout_s: float) -> Set | None:
         """The next set; None when none came within ``timeout_s`` (seconds)."""
 
@@ -87,7 +85,7 @@ class PacedPlayback:
     """Through the SDK's pipeline, at the pace of the recording; what the reader is too slow for is lost.
 
     Where a repeated recording starts over, or the reader is slow, the SDK may pair colour and depth of different
-    moments: such sets are dropped, and counted.
+    moments: such sets are dropped.
     """
 
     def __init__(self, path: str, repeat: bool) -> None:
@@ -98,7 +96,6 @@ class PacedPlayback:
         self._device = self._pipeline.start(config).get_device().as_playback()
         self._last = (-1, -1)
         self._torn_in_a_row_n = 0
-        self.torn_dropped_n = 0
 
     def next(self, timeout_s: float) -> Set | None:
         """See `Playback`."""
@@ -111,7 +108,6 @@ class PacedPlayback:
         depth = self._decoder.depth(depth_frame) if depth_frame else None
         numbers = (color.number, depth.number if depth else -1)
         if self._is_torn(numbers, color, depth):
-            self.torn_dropped_n += 1
             self._torn_in_a_row_n += 1
             if self._torn_in_a_row_n < TORN_SHOWN_N:
                 return None
@@ -148,7 +144,6 @@ class WholePlayback:
 
     def __init__(self, path: str, repeat: bool) -> None:
         self._path, self._repeat = path, repeat
-        self.torn_dropped_n = 0
         self._decoder = Decoder()
         self._closing = threading.Event()
         self._sensors: list[sdk.Rs] = []

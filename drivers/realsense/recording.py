@@ -53,11 +53,6 @@ class RecordingCamera:
                 where, f"not a readable RealSense recording ({cause})", "Give a .db3 or .bag made by librealsense"
             ) from error
 
-    @property
-    def torn_dropped_n(self) -> int:
-        """So many sets were dropped because playing had torn them."""
-        return self._playback.torn_dropped_n if self._playback is not None else 0
-
     def read(self, timeout_s: float) -> Frame:
         """The next frame set.
 
