@@ -20,7 +20,7 @@ CAMERA = CameraSettings(source="rig", path="nowhere", stale_s=0.3, restart_s=0.8
 DEADLINE_S = 20.0
 
 PRELUDE = """
-import json, os, sys, time
+import json, os, signal, sys, time
 start = json.loads(sys.stdin.readline())
 log = open(LOG, "a"); log.write(json.dumps({"pid": os.getpid(), "reset": start["reset_first"]}) + "\\n"); log.close()
 starts = len(open(LOG).readlines())
@@ -87,7 +87,7 @@ async def test_frames_flow_and_each_is_taken_once(tmp_path: Path) -> None:
 
 
 async def test_frames_that_stop_are_unknown_at_once_and_the_child_is_replaced(tmp_path: Path) -> None:
-    body = "opened()\nfor n in range(5):\n    frame(n); time.sleep(0.03)\ntime.sleep(3600)\n"
+    body = "opened()\nfor n in range(5):\n    frame(n); time.sleep(0.03)\nsignal.pause()\n"
     async with worker(tmp_path, body) as eyes:
         await until(lambda: eyes.newest is not None)
         await until(lambda: "stale" in conditions(eyes))
@@ -99,7 +99,7 @@ async def test_frames_that_stop_are_unknown_at_once_and_the_child_is_replaced(tm
 
 async def test_a_library_call_that_never_returns_at_the_start(tmp_path: Path) -> None:
     camera = CAMERA.model_copy(update={"restart_s": 0.5})
-    async with worker(tmp_path, "opened()\ntime.sleep(3600)\n", camera) as eyes:
+    async with worker(tmp_path, "opened()\nsignal.pause()\n", camera) as eyes:
         await until(lambda: len(starts(tmp_path)) >= 3)
         assert "stale" in conditions(eyes)
         assert eyes.newest is None
@@ -131,9 +131,7 @@ async def test_it_comes_back_when_the_camera_does(tmp_path: Path) -> None:
 
 
 async def test_nonsense_from_the_child_ends_it(tmp_path: Path) -> None:
-    async with worker(
-        tmp_path, 'opened()\nsys.stdout.write("hello\\n"); sys.stdout.flush()\ntime.sleep(3600)\n'
-    ) as eyes:
+    async with worker(tmp_path, 'opened()\nsys.stdout.write("hello\\n"); sys.stdout.flush()\nsignal.pause()\n') as eyes:
         await until(lambda: len(starts(tmp_path)) >= 2)
         assert eyes.newest is None
 
