@@ -13,8 +13,6 @@ from drivers.dynamixel.codec import (
 from drivers.dynamixel.virtual import VirtualServo
 from tests.servo_line import Line, moving
 
-KEY = bytes((0x43, 0x54, 0x52, 0x4C))
-
 
 @pytest.fixture
 def line() -> Line:
