@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import socket
 import struct
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -204,6 +204,8 @@ def remove_vcan(name: str) -> None:
     """Take a virtual CAN interface away; none is fine."""
     if interface_exists(name):
         # Linux before 6.1.192 waits here for as long as somebody has a J1939 socket open on it, and cannot be killed.
-        remove = subprocess.Popen(["ip", "link", "del", name])
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            remove.wait(5.0)
+        # The thread waits on where we do not, so that the process is reaped whenever the kernel lets it go.
+        command = ["ip", "link", "del", name]
+        remove = threading.Thread(target=subprocess.run, args=(command,), name=f"remove {name}", daemon=True)
+        remove.start()
+        remove.join(5.0)
