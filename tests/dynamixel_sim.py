@@ -16,6 +16,7 @@ from typing import Any
 from drivers.dynamixel import Ph54Rotator
 from drivers.dynamixel.virtual import VirtualServo, VirtualServoBus
 from graderd.hal.settings import RotatorSettings
+from tests.patience import PatientClock
 
 PATIENCE_S = 15.0
 """Deadline of waits in tests: long, because the machine may be busy; nothing is measured by it."""
@@ -28,6 +29,7 @@ class Bench:
     rotator: Ph54Rotator
     servo: VirtualServo
     bus: VirtualServoBus
+    clock: PatientClock
 
     def conditions(self) -> set[str]:
         return {f.condition for f in self.rotator.faults()}
@@ -81,15 +83,16 @@ async def bench(
 ) -> AsyncIterator[Bench]:
     """A virtual servo at ``folder/servo`` and a rotator on it, opened unless told otherwise; all closed at the end."""
     servo = servo or VirtualServo()
-    bus = VirtualServoBus([servo], folder / "servo", **(wire or {}))
+    clock = PatientClock()
+    bus = VirtualServoBus([servo], folder / "servo", clock=clock, **(wire or {}))
     brisk = {"velocity_deg_per_s": 60.0, "acceleration_deg_per_s2": 240.0}  # so that tests need not wait for the blade
     settings = RotatorSettings(**{"port": str(folder / "servo"), **brisk, **changes})
-    rotator = Ph54Rotator(settings)
+    rotator = Ph54Rotator(settings, clock=clock)
     await bus.start()
     try:
         if opened:
             await rotator.open()
-        yield Bench(rotator, servo, bus)
+        yield Bench(rotator, servo, bus, clock)
     finally:
         await rotator.close()
         await bus.close()

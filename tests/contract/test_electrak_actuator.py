@@ -17,7 +17,6 @@ import pytest
 from drivers.electrak import CanLink, ElectrakActuator
 from drivers.electrak.ports import BusPort
 from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
-from graderd.hal.clock import SystemClock
 from graderd.hal.errors import (
     CommandRangeError,
     DeviceMissingError,
@@ -30,6 +29,7 @@ from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.settings import ActuatorSettings, CanSettings
 from tests.electrak_sim import until
+from tests.patience import PatientClock
 
 VCAN = next((path.name for path in sorted(Path("/sys/class/net").glob("vcan*"))), None)
 WIRES = ["in_process", "python_can_virtual", "slcan_pty", *([VCAN] if VCAN else [])]
@@ -39,7 +39,7 @@ class Bench:
     """One virtual actuator, the link and the driver under test."""
 
     def __init__(self, wire: str, tmp_path: Path) -> None:
-        self.clock = SystemClock()
+        self.clock = PatientClock()
         self.unit = VirtualElectrak(position_mm=100.0, seed=5)
         self.external: can.BusABC | None = None
         self.bus: VirtualActuatorBus
@@ -54,7 +54,7 @@ class Bench:
         elif wire != "python_can_virtual":
             settings = CanSettings(interface="socketcan", channel=wire)
             self.external = can.Bus(interface="socketcan", channel=wire)
-        self.bus = VirtualActuatorBus([self.unit], link=link, bus=self.external)
+        self.bus = VirtualActuatorBus([self.unit], link=link, bus=self.external, clock=self.clock)
         self.link = CanLink(settings, self.clock, bus_factory=factory)
         self.axis = ElectrakActuator("lift_left", ActuatorSettings(address_n=19), self.link, self.clock)
         self._relay: asyncio.Task[None] | None = None

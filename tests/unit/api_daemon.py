@@ -20,6 +20,7 @@ from graderd.core.machine import Goals, Inputs, Lease, MachineSettings, Mode, Po
 from graderd.core.rule import RuleSettings
 from graderd.core.status import AttitudeStatus, AxisStatus, LeaseStatus, RequirementStatus, SoilStatus, Status
 from graderd.hal.lifecycle import Lifecycle
+from tests.patience import PatientClock
 
 T = TypeVar("T")
 
@@ -48,11 +49,12 @@ class FakeDaemon:
 
     def __post_init__(self) -> None:
         self.waiting: list[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = []
+        self._clock = PatientClock()
         self._ticked = asyncio.Event()
         self._moving: set[str] = set()
         self._goals = Goals()
         self._active = False
-        self._status = self._make_status(time.monotonic())
+        self._status = self._make_status(self._clock.now_s())
 
     async def run(self) -> None:
         """Tick until cancelled."""
@@ -60,7 +62,7 @@ class FakeDaemon:
         while True:
             now_s = time.monotonic()
             self.late_s.append(now_s - due_s)
-            self._tick(now_s)
+            self._tick(self._clock.now_s())
             due_s = max(due_s + TICK_S, now_s)
             await asyncio.sleep(due_s - time.monotonic())
 
@@ -244,7 +246,7 @@ class FakeDaemon:
 
     def hold_lease(self, client: str) -> None:
         """Let somebody else have the lease for a minute."""
-        self.state = replace(self.state, lease=Lease(client, time.monotonic() + 60.0))
+        self.state = replace(self.state, lease=Lease(client, self._clock.now_s() + 60.0))
 
 
 async def within(timeout_s: float, awaitable: Awaitable[T]) -> T:

@@ -12,20 +12,20 @@ import pytest
 from graderd.config import Config
 from graderd.core import commands as cmd
 from graderd.core.machine import Mode
-from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceLostError, DeviceRefusedError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.maneuver import Maneuver
 from graderd.runtime.state_file import StateFile
 from tests.fakes import FakeMachine
+from tests.patience import PatientClock
 
 
 @asynccontextmanager
 async def running(tmp_path: Path) -> AsyncIterator[tuple[FakeMachine, ControlLoop]]:
     """A control loop ticking in real time over fake devices."""
     machine = FakeMachine()
-    clock = SystemClock()
+    clock = PatientClock()
     for device in (machine.rotation, machine.lift_left, machine.lift_right, machine.tilt):
         device.clock = clock  # type: ignore[assignment]  # the fakes only read it
     loop = ControlLoop(Config(), machine.devices, machine.eyes, clock, StateFile(str(tmp_path)))

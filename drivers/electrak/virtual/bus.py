@@ -117,6 +117,11 @@ class VirtualActuatorBus:
             bus.shutdown()
         self._buses.clear()
 
+    @property
+    def channel_open(self) -> bool:
+        """Whether a host has opened the slcan adapter's channel: frames reach it from then on."""
+        return self._adapter is not None and self._adapter.is_open
+
     def connect(self) -> WireBus:
         """Another node on the wire, as a python-can bus of this process; closed with this object at the latest."""
         bus = WireBus(self.wire)
