@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 _LONGEST_STEP_S = 0.05
@@ -18,10 +19,12 @@ class PatientClock:
     def __init__(self) -> None:
         self._looked_s = time.monotonic()
         self._withheld_s = 0.0
+        self._lock = threading.Lock()
 
     def now_s(self) -> float:
         """Seconds, never back."""
-        now_s = time.monotonic()
-        self._withheld_s += max(0.0, now_s - self._looked_s - _LONGEST_STEP_S)
-        self._looked_s = now_s
-        return now_s - self._withheld_s
+        with self._lock:
+            now_s = time.monotonic()
+            self._withheld_s += max(0.0, now_s - self._looked_s - _LONGEST_STEP_S)
+            self._looked_s = now_s
+            return now_s - self._withheld_s

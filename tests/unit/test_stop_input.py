@@ -25,6 +25,7 @@ from graderd.hal.errors import DeviceLostError, DeviceMissingError
 from graderd.hal.settings import StopInputSettings
 from graderd.hal.stop_input import StopInput
 from graderd.runtime.stop_input import FIRST_WORD_S, StopInputWatch
+from tests.patience import PatientClock
 
 DEADLINE_S = 5.0
 
@@ -252,17 +253,20 @@ def test_every_condition_stops_until_reset(condition: str) -> None:
 class Watching:
     """A watch over the simulated loop, and what it told."""
 
-    def __init__(self, watch: StopInputWatch, loop: StopLoop, stops: list[tuple[float, str]]) -> None:
+    def __init__(
+        self, watch: StopInputWatch, loop: StopLoop, stops: list[tuple[float, str]], clock: PatientClock
+    ) -> None:
         self.watch = watch
         self.loop = loop
         self.stops = stops
+        self.clock = clock
 
     async def permitted(self) -> None:
         """Wait until the loop was read and found closed."""
         await self.until(lambda: not self.watch._word.condition and self.conditions() == [])
 
     def conditions(self) -> list[str]:
-        return [fault.condition for fault in self.watch.faults(time.monotonic())]
+        return [fault.condition for fault in self.watch.faults(self.clock.now_s())]
 
     async def until(self, reached: Callable[[], bool]) -> None:
         async with asyncio.timeout(DEADLINE_S):
@@ -275,15 +279,16 @@ async def watching(tmp_path: Path, source: StopInput | None = None, **settings: 
     loop = StopLoop(tmp_path / "stop.sock")
     await loop.start()
     stops: list[tuple[float, str]] = []
+    clock = PatientClock()
     watch = StopInputWatch(
         StopInputSettings(backend="simulated", **settings),
         source or SimulatedStopInput(str(loop.path)),
-        SystemClock(),
-        lambda reason: stops.append((time.monotonic(), reason)),
+        clock,
+        lambda reason: stops.append((clock.now_s(), reason)),
     )
     task = asyncio.create_task(watch.run(), name="watch")
     try:
-        yield Watching(watch, loop, stops)
+        yield Watching(watch, loop, stops, clock)
     finally:
         task.cancel()
         with suppress(asyncio.CancelledError):
@@ -304,7 +309,7 @@ async def test_without_a_first_reading_it_soon_means_stop(tmp_path: Path) -> Non
 async def test_a_press_is_told_at_once_and_once_and_stands_until_released(tmp_path: Path) -> None:
     async with watching(tmp_path) as w:
         await w.permitted()
-        pressed_s = time.monotonic()
+        pressed_s = w.clock.now_s()
         await w.loop.become("open")
         await w.until(lambda: bool(w.stops))
         # Two looks at 100 Hz; the rest is for a loaded machine.
@@ -347,7 +352,7 @@ async def test_a_port_that_blocks_is_stale_and_nothing_else_waits_for_it(tmp_pat
 
     async with watching(tmp_path, Blocking(str(tmp_path / "stop.sock")), stale_s=0.1) as w:
         # Never read: lost from the beginning, whatever its age.
-        assert [f.condition for f in w.watch.faults(time.monotonic() + FIRST_WORD_S)] == ["lost"]
+        assert [f.condition for f in w.watch.faults(w.clock.now_s() + FIRST_WORD_S)] == ["lost"]
         release.set()
         await w.permitted()
         release.clear()

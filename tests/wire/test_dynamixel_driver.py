@@ -17,6 +17,7 @@ from graderd.hal.errors import DeviceError, DeviceTimeoutError, LifecycleError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import RotatorSettings
 from tests.dynamixel_sim import bench, until
+from tests.patience import PatientClock
 
 TABLE = ControlTable.load("ph54_200_s500")
 PROFILE = TABLE["profile_acceleration"].address
@@ -43,10 +44,11 @@ class Tap:
 
 
 async def tapped(tmp_path: Path, servo: VirtualServo, **changes: float) -> tuple[Tap, Ph54Rotator, VirtualServoBus]:
-    wire = VirtualServoBus([servo], tmp_path / "servo")
+    clock = PatientClock()
+    wire = VirtualServoBus([servo], tmp_path / "servo", clock=clock)
     await wire.start()
     tap = Tap()
-    rotator = Ph54Rotator(RotatorSettings(**{"port": str(tmp_path / "servo"), **changes}), bus_log=tap)
+    rotator = Ph54Rotator(RotatorSettings(**{"port": str(tmp_path / "servo"), **changes}), clock=clock, bus_log=tap)
     await rotator.open()
     return tap, rotator, wire
 
@@ -68,7 +70,7 @@ async def test_hold_is_the_very_next_packet(tmp_path: Path) -> None:
         await asyncio.sleep(0.05 + i * 0.0017)
         before_n = len(tap.sent)
         rotator.hold()
-        await until(lambda n=before_n: len(tap.sent) > n, "nothing was sent")  # type: ignore[misc]
+        await until(lambda n=before_n: tap.writes(n), "nothing was written")  # type: ignore[misc]
         address, data = tap.writes(before_n)[0]
         assert tap.sent[before_n][1].instruction in (Instruction.WRITE, Instruction.PING)  # a ping only after a loss
         assert (address, len(data)) == (PROFILE, 12)
@@ -83,6 +85,7 @@ async def test_goals_are_sent_once_and_the_profile_only_after_a_hold(tmp_path: P
     for _ in range(10):
         rotator.set_goal_deg(5.0)
         await asyncio.sleep(0.02)
+    await until(lambda: tap.writes(start), "no goal")
     counts = rotator.calibration.counts(5.0).to_bytes(4, "little", signed=True)
     assert set(tap.writes(start)) == {(GOAL, counts)}
     assert len(tap.writes(start)) <= 2  # two only where a reply was lost on a busy machine

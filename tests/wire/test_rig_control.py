@@ -15,6 +15,7 @@ import pytest
 from drivers.rig.control import RigControl, rig_request
 from drivers.rig.server import Rig
 from graderd.hal.errors import DeviceLostError, DeviceMissingError, DeviceRefusedError
+from tests.electrak_sim import until
 
 READY_S = 30.0
 
@@ -44,6 +45,22 @@ async def state_when(control: RigControl, key: str, value: object) -> dict[str, 
             if state[key] == value:
                 return state
             await asyncio.sleep(0.02)
+
+
+async def steps(machine: Rig, count: int = 3) -> None:
+    """Wait until the rig's world was moved on so many times more."""
+    seen_n, step = 0, machine.machine.step
+
+    def counted(step_s: float) -> None:
+        nonlocal seen_n
+        step(step_s)
+        seen_n += 1
+
+    machine.machine.step = counted  # type: ignore[method-assign]
+    try:
+        await until(lambda: seen_n >= count)
+    finally:
+        del machine.machine.step  # the class's own is found again
 
 
 NONSENSE = (
@@ -121,11 +138,11 @@ async def test_rig_hangs_up_on_a_line_without_end(rig: tuple[Rig, RigControl]) -
 
 
 async def test_rig_scene_drive_and_views(rig: tuple[Rig, RigControl], tmp_path: Path) -> None:
-    _, control = rig
+    machine, control = rig
     volumes = {}
     for zone in ("left", "center", "right", "even", "none"):
         await control.scene(zone, seed=5)
-        await asyncio.sleep(0.05)
+        await steps(machine)
         state = await control.state()
         volumes[zone] = [state["vol_left_l"], state["vol_center_l"], state["vol_right_l"]]
     for index, zone in enumerate(("left", "center", "right")):
@@ -161,9 +178,9 @@ async def test_rig_scene_drive_and_views(rig: tuple[Rig, RigControl], tmp_path: 
 
 
 async def test_rig_place_pours_more_soil_where_it_is_told(rig: tuple[Rig, RigControl]) -> None:
-    _, control = rig
+    machine, control = rig
     await control.request("place", x_m=0.3, y_m=-0.33, length_m=0.3, width_m=0.25, height_m=0.15)
-    await asyncio.sleep(0.1)
+    await steps(machine)
     first = await control.state()
     assert first["vol_right_l"] > 2.0
     assert first["vol_left_l"] < 0.1
@@ -185,10 +202,10 @@ async def test_rig_forwards_faults_and_clears_them(rig: tuple[Rig, RigControl]) 
     await control.request("actuator_fault", name="stuck", device="lift_right")
     assert [unit.faults.stuck for unit in (machine.machine.lift_left, machine.machine.lift_right)] == [False, True]
     await control.request("servo_fault", name="push", params={"torque_nm": 33.0})
-    await asyncio.sleep(0.05)
+    await steps(machine)
     assert machine.machine.servo.load_torque_nm == 33.0  # the soil's load does not overwrite the fault
     await control.request("clear_faults")
-    await asyncio.sleep(0.05)
+    await steps(machine)
     assert machine.paths.servo.is_symlink()
     assert machine.paths.can.is_symlink()
     assert [unit.faults.stuck for unit in (machine.machine.lift_left, machine.machine.lift_right)] == [False, False]
@@ -202,7 +219,7 @@ async def test_rig_lifts_carry_the_blade_and_feel_its_weight(rig: tuple[Rig, Rig
         140.0,
         60.0,
     )
-    await asyncio.sleep(0.05)
+    await steps(machine)
     state = await control.state()
     assert state["blade_height_mm"] == pytest.approx(50.0)
     assert state["blade_slope_deg"] == pytest.approx(1.43, abs=0.01)
