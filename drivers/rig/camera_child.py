@@ -12,6 +12,7 @@ from typing import Any
 from graderd.hal.errors import DeviceLostError
 
 _START_S = 15.0
+_ANSWER_S = 10.0
 _END_S = 1.0
 
 
@@ -23,6 +24,8 @@ class CameraChild:
         self._path = path
         self._seed = seed
         self._process: asyncio.subprocess.Process | None = None
+        self._telling = asyncio.Lock()
+        self._changes_n = 0
 
     @property
     def pid(self) -> int:
@@ -42,13 +45,7 @@ class CameraChild:
             stdout=subprocess.PIPE,
             pass_fds=(self._descriptor,),
         )
-        assert self._process.stdout is not None
-        try:
-            async with asyncio.timeout(_START_S):
-                line = await self._process.stdout.readline()
-        except TimeoutError:
-            line = b""
-        if line != b"ready\n":
+        if not await self._says("ready", _START_S):
             raise DeviceLostError("rig camera", "its process did not start", "See its message above")
 
     async def watch(self) -> None:
@@ -76,8 +73,29 @@ class CameraChild:
             await process.wait()
 
     async def tell(self, message: dict[str, Any]) -> None:
-        """Send it a change: ``look``, ``fault`` with ``params``, or ``clear``."""
+        """Change it: ``look``, ``fault`` with ``params``, or ``clear``; a picture asked for afterwards shows it.
+
+        Raises:
+            DeviceLostError: it does not say that it did so.
+        """
         assert self._process is not None
         assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps(message).encode() + b"\n")
-        await self._process.stdin.drain()
+        async with self._telling:
+            self._changes_n += 1
+            self._process.stdin.write(json.dumps({"number": self._changes_n, **message}).encode() + b"\n")
+            await self._process.stdin.drain()
+            if not await self._says(f"changed {self._changes_n}", _ANSWER_S):
+                raise DeviceLostError("rig camera", "its process does not answer", "Start the rig again")
+
+    async def _says(self, text: str, within_s: float) -> bool:
+        """Whether it says so in time. Answers that nobody waited for any more are passed over."""
+        assert self._process is not None
+        assert self._process.stdout is not None
+        try:
+            async with asyncio.timeout(within_s):
+                while line := await self._process.stdout.readline():
+                    if line.decode().rstrip() == text:
+                        return True
+        except TimeoutError:
+            pass
+        return False

@@ -1,8 +1,8 @@
 """The rig's camera: a process of its own that renders when a client asks and never holds up the wires.
 
 ``python -m drivers.rig.camera_server --memory FD --socket PATH`` is started by the rig with its shared memory as an
-inherited descriptor and a pipe on standard input. JSON lines on that pipe change light and faults; its end, or the
-rig's death, ends this process.
+inherited descriptor and a pipe on standard input. JSON lines on that pipe change light and faults, each answered by
+``changed`` and its number on standard output once it holds; the pipe's end, or the rig's death, ends this process.
 
 Wire format of the socket: the client writes one JSON object a line, ``{"open": {...}}`` first, then ``{"next": n}`` for
 the newest frame with a number above ``n``. Each answer is one JSON line, followed after a frame's header by the
@@ -276,6 +276,11 @@ def _line(message: dict[str, Any]) -> bytes:
     return json.dumps(message).encode() + b"\n"
 
 
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
 def main() -> int:
     """Serve until the rig's pipe ends."""
     parser = argparse.ArgumentParser(description="the rig's camera; started by the rig itself")
@@ -289,10 +294,11 @@ def main() -> int:
     cv2.setNumThreads(1)
     camera = CameraProcess(SharedScene.open(arguments.memory), arguments.socket, arguments.seed)
     camera.plug()
-    sys.stdout.write("ready\n")
-    sys.stdout.flush()
+    _say("ready")
     for line in sys.stdin:
-        camera.change(json.loads(line))
+        message = json.loads(line)
+        camera.change(message)
+        _say(f"changed {message['number']}")
     camera.unplug()
     # Threads may still sit in a client's socket; nothing of theirs is worth waiting for.
     os._exit(0)

@@ -248,13 +248,10 @@ async def test_rig_camera_unplugged_is_lost_at_once_and_can_come_back(rig: tuple
 async def test_rig_camera_settings_that_did_not_keep_read_back_as_they_are(rig: tuple[Rig, RigControl]) -> None:
     machine, control = rig
     await control.request("camera_fault", name="settings_lost")
-    exposure = 0.0
-    async with asyncio.timeout(10.0):
-        while exposure != 1.0:  # the camera is a process of its own: it hears of the fault when it hears of it
-            camera = RigCamera(settings_for(machine.paths.camera))
-            await asyncio.to_thread(camera.open)
-            exposure = camera.settings_read_back()["auto_exposure"]
-            camera.close()
+    camera = RigCamera(settings_for(machine.paths.camera))
+    await asyncio.to_thread(camera.open)
+    assert camera.settings_read_back()["auto_exposure"] == 1.0
+    camera.close()
 
 
 async def test_rig_wires_are_not_held_up_by_a_picture(rig: tuple[Rig, RigControl]) -> None:
