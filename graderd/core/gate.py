@@ -165,7 +165,8 @@ def pass_gate(state: GateState, goals: Goals, inputs: GateInputs) -> tuple[GateS
             passed[axis] = AxisPass(requested, None, refusal)
             continue
         bounded, why = _bound(requested, limits[axis], former.armed_at)
-        setpoints[axis] = _leash(_advance(former, bounded, limits[axis], inputs.dt_s), measured, limits[axis])
+        advanced = _fence(_advance(former, bounded, limits[axis], inputs.dt_s), former, limits[axis])
+        setpoints[axis] = _leash(advanced, measured, limits[axis])
         passed[axis] = AxisPass(requested, setpoints[axis].position, why)
     return GateState(setpoints), passed
 
@@ -213,6 +214,8 @@ def _advance(former: Setpoint, goal: float, limits: AxisLimits, dt_s: float) -> 
 
     The speed from which it can still stop within the remaining way with ticks of ``dt_s`` is
     ``a dt (sqrt(1/4 + 2 d / (a dt²)) - 1/2)``: the discrete form of ``sqrt(2 a d)``, so that it never overshoots.
+    A tick that comes late brakes late: where there was room to stop, the way ends at the goal all the same. Only a
+    goal that was moved nearer than the way to stop is passed, and come back to.
     """
     if dt_s <= 0.0:
         return former
@@ -222,10 +225,21 @@ def _advance(former: Setpoint, goal: float, limits: AxisLimits, dt_s: float) -> 
     wanted = math.copysign(min(limits.speed, stoppable), distance)
     speed = min(max(wanted, former.speed - step_speed), former.speed + step_speed)
     position = former.position + speed * dt_s
-    arrived = abs(goal - position) <= step_speed * dt_s and abs(speed) <= 2.0 * step_speed
-    if arrived:
+    near = abs(goal - position) <= step_speed * dt_s and abs(speed) <= 2.0 * step_speed
+    arrived = near and abs(distance) <= limits.speed * dt_s
+    passed = (position - goal) * distance > 0.0 and former.speed**2 <= 2.0 * limits.acceleration * abs(distance)
+    if arrived or passed:
         return replace(former, position=goal, speed=0.0)
     return replace(former, position=position, speed=speed)
+
+
+def _fence(setpoint: Setpoint, former: Setpoint, limits: AxisLimits) -> Setpoint:
+    """Never out of limits and window; from outside (pushed there while it was held) only further in."""
+    low = min(max(limits.low, former.armed_at - limits.window), former.position)
+    high = max(min(limits.high, former.armed_at + limits.window), former.position)
+    if low <= setpoint.position <= high:
+        return setpoint
+    return replace(setpoint, position=min(max(setpoint.position, low), high), speed=0.0)
 
 
 def _leash(setpoint: Setpoint, measured: float, limits: AxisLimits) -> Setpoint:

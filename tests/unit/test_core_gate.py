@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from dataclasses import replace
 from itertools import pairwise
 
@@ -148,6 +149,69 @@ def test_whatever_is_asked_the_goal_stays_inside_and_slow(asked: list[tuple[floa
         assert abs(limited - last) <= limits.speed * DT_S + 1e-6
         last = limited
         pose = replace(pose, rotation_deg=limited)
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("side", ["low", "high"])
+def test_late_ticks_do_not_carry_it_past_a_standing_goal(axis: str, side: str) -> None:
+    """On a busy machine ticks come late, and with them the braking; the goal here is the axis's own limit."""
+    limits = SETTINGS.limits()[axis]
+    wanted = getattr(limits, side)
+    for seed in range(30):
+        ticks = random.Random(seed)
+        state, pose, last = GateState(), POSE, getattr(POSE, FIELDS[axis])
+        while last != wanted:
+            dt_s = ticks.choice((0.001, 0.01, 0.02, 0.02, 0.021, 0.04, 0.08, 0.2))
+            state, passed = pass_gate(state, goal(axis, wanted), inputs(pose=pose, dt_s=dt_s))
+            limited = passed[axis].limited
+            assert limited is not None
+            assert min(last, wanted) <= limited <= max(last, wanted)
+            assert abs(limited - last) <= limits.speed * dt_s + 1e-6
+            last = limited
+            pose = replace(pose, **{FIELDS[axis]: limited})
+
+
+@given(st.lists(st.tuples(st.floats(-70, 70), st.sampled_from((0.005, 0.02, 0.05, 0.2))), min_size=1, max_size=80))
+@settings(max_examples=200)
+def test_with_goals_that_change_and_ticks_that_are_late_it_stays_inside(asked: list[tuple[float, float]]) -> None:
+    narrow = SETTINGS.model_copy(update={"rotation_window_deg": 8.0})
+    for given_settings, low, high in ((SETTINGS, -60.0, 60.0), (narrow, 42.0, 58.0)):
+        state, pose = GateState(), replace(POSE, rotation_deg=50.0)
+        for value, dt_s in asked:
+            step = inputs(settings=given_settings, pose=pose, dt_s=dt_s)
+            state, passed = pass_gate(state, Goals(rotation_deg=value), step)
+            limited = passed["rotation"].limited
+            assert limited is not None
+            assert low <= limited <= high
+            pose = replace(pose, rotation_deg=limited)
+
+
+def test_a_goal_moved_nearer_than_the_way_to_stop_is_passed_and_come_back_to() -> None:
+    limits = SETTINGS.limits()["rotation"]
+    way_to_stop = limits.speed**2 / (2.0 * limits.acceleration)
+    state = GateState({"rotation": Setpoint(0.0, limits.speed, 0.0)})
+    seen, pose = [0.0], POSE
+    for _ in range(400):
+        state, passed = pass_gate(state, goal("rotation", 0.5 * way_to_stop), inputs(pose=pose))
+        limited = passed["rotation"].limited
+        assert limited is not None
+        seen.append(limited)
+        pose = replace(pose, rotation_deg=limited)
+    assert 0.9 * way_to_stop < max(seen) < 1.1 * way_to_stop
+    assert seen[-1] == 0.5 * way_to_stop
+
+
+@pytest.mark.parametrize(("at", "first"), [(61.0, 61.0), (-61.0, -61.0)])
+def test_pushed_outside_it_goes_in_and_never_further_out(at: float, first: float) -> None:
+    sign = math.copysign(1.0, at)
+    outward = GateState({"rotation": Setpoint(at, sign * 20.0, at)})
+    _, passed = pass_gate(outward, goal("rotation", 0.0), inputs(pose=replace(POSE, rotation_deg=at)))
+    assert passed["rotation"].limited == first
+    at_rest = GateState({"rotation": Setpoint(at, 0.0, at)})
+    _, passed = pass_gate(at_rest, goal("rotation", 50.0 * sign), inputs(pose=replace(POSE, rotation_deg=at)))
+    limited = passed["rotation"].limited
+    assert limited is not None
+    assert 60.0 < abs(limited) < 61.0
 
 
 def test_rotation_waits_for_the_blade_height() -> None:
