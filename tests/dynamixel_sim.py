@@ -13,8 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from drivers.dynamixel import Ph54Rotator
 from drivers.dynamixel.virtual import VirtualServo, VirtualServoBus
+from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import RotatorSettings
 from tests.patience import PatientClock
 
@@ -63,6 +66,28 @@ class Bench:
             return angle is not None and abs(angle.value - angle_deg) <= tolerance_deg
 
         return there
+
+
+async def armed_at(rig: Bench, goal_deg: float) -> None:
+    """Arm and drive somewhere, so that there is something to lose."""
+    await rig.rotator.arm()
+    await rig.drive(goal_deg, rig.at(goal_deg))
+
+
+async def works_again(rig: Bench, goal_deg: float = 10.0) -> None:
+    """Faults gone, arm, and the blade goes where it is told: without a jump on the way."""
+    await rig.until(lambda: rig.rotator.lifecycle is Lifecycle.STANDBY, "not in standby")
+    await rig.until(lambda: not rig.conditions(), "faults did not clear")
+    before_deg = rig.servo.shaft_deg
+    await rig.rotator.arm()
+    await asyncio.sleep(0.1)
+    assert rig.servo.shaft_deg == pytest.approx(before_deg, abs=0.3)
+    await rig.drive(goal_deg, rig.at(goal_deg))
+    assert not rig.conditions()
+
+
+def standing(rig: Bench) -> bool:
+    return abs(rig.servo.shaft_velocity_deg_per_s) < 0.5
 
 
 async def until(met: Callable[[], object], what: str, timeout_s: float = PATIENCE_S) -> None:

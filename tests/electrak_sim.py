@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from drivers.electrak import CanLink, ElectrakActuator
 from drivers.electrak.ports import BusPort
 from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
+from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import ActuatorSettings, CanSettings
 
 T = TypeVar("T")
@@ -66,6 +67,15 @@ async def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
     async with asyncio.timeout(timeout_s):
         while not condition():
             await asyncio.sleep(0.01)
+
+
+def conditions(link: CanLink) -> set[str]:
+    return {fault.condition for fault in link.faults()}
+
+
+def state(axis: ElectrakActuator) -> Lifecycle:
+    """A call, so that the type checker does not take the state for a constant."""
+    return axis.lifecycle
 
 
 class Machine:
