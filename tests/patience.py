@@ -11,9 +11,9 @@ _LONGEST_STEP_S = 0.05
 class PatientClock:
     """Monotonic seconds, less what the machine withheld from this process.
 
-    Device, driver and test share it. Where nobody looked for more than 50 ms (something ticks every few milliseconds
-    in each of them), the process had no processor; had that time passed, deadlines that both ends keep to the letter
-    would be missed by neither of them.
+    Device, driver and test share it, and something in each of them looks every few milliseconds. Where nobody did for
+    more than 50 ms the process had no processor, and of that time only 50 ms count: a deadline is then missed by what
+    one of them does, not by what the machine does to all of them.
     """
 
     def __init__(self) -> None:

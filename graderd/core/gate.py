@@ -235,8 +235,8 @@ def _advance(former: Setpoint, goal: float, limits: AxisLimits, dt_s: float) -> 
 
 def _fence(setpoint: Setpoint, former: Setpoint, limits: AxisLimits) -> Setpoint:
     """Never out of limits and window; from outside (pushed there while it was held) only further in."""
-    low = min(max(limits.low, former.armed_at - limits.window), former.position)
-    high = max(min(limits.high, former.armed_at + limits.window), former.position)
+    bounded, _ = _bound(setpoint.position, limits, former.armed_at)
+    low, high = min(bounded, former.position), max(bounded, former.position)
     if low <= setpoint.position <= high:
         return setpoint
     return replace(setpoint, position=min(max(setpoint.position, low), high), speed=0.0)

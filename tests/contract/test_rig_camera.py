@@ -215,7 +215,7 @@ async def test_rig_camera_that_stalls_times_out_and_goes_on(rig: tuple[Rig, RigC
         started_s = time.monotonic()
         with pytest.raises(DeviceTimeoutError):
             await shot(camera, 0.2)
-        assert time.monotonic() - started_s < 3.0
+        assert time.monotonic() - started_s < 1.0
     await control.request("clear_faults")
     assert (await shot(camera)).color_bgr.shape == (200, 320, 3)
     camera.close()
@@ -233,7 +233,7 @@ async def test_rig_camera_unplugged_is_lost_at_once_and_can_come_back(rig: tuple
         await shot(camera)
     with pytest.raises((DeviceLostError, LifecycleError)):
         await shot(camera)
-    assert time.monotonic() - started_s < 4.0, "it must not be the deadline of 5 s that ended it"
+    assert time.monotonic() - started_s < 1.0
     with pytest.raises(DeviceMissingError):
         await asyncio.to_thread(camera.open)
     await control.request("clear_faults")

@@ -98,7 +98,7 @@ async def test_a_hung_adapter_fills_the_queue_and_never_blocks_the_loop(tmp_path
         start_s = loop.time()
         for _ in range(3000):
             link.request(Pgn.SOFTWARE_ID)
-        assert loop.time() - start_s < 5.0
+        assert loop.time() - start_s < 1.0
         assert "queue_overrun" in conditions(link)
         bus.clear_faults()
         await asyncio.sleep(0.3)

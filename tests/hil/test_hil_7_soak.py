@@ -66,7 +66,7 @@ class Soak:
         """The wall clock jumps."""
         real_s, mono_s = time.time(), time.monotonic()
         time.clock_settime(time.CLOCK_REALTIME, real_s + self.random.choice((-5000.0, 5000.0)))
-        time.sleep(0.5)
+        time.sleep(0.5)  # so long the clock is wrong
         time.clock_settime(time.CLOCK_REALTIME, real_s + time.monotonic() - mono_s)
 
     def stop_and_reset(self) -> None:
@@ -104,10 +104,10 @@ class Soak:
     def stands_while_disarmed(self) -> None:
         """Disarmed, the blade stands and nothing enables motion."""
         listener = bus.RawBus("wire0")
-        time.sleep(0.3)
+        time.sleep(0.3)  # what was on its way when it was disarmed
         before = self.rig.ask("state")["blade_deg"]
         listener.drain()
-        time.sleep(0.5)
+        time.sleep(0.5)  # so long nothing may happen
         enabled = [f for f in listener.drain() if f.pgn == 0xEF00 and f.data[3] & 0x10]
         listener.close()
         assert not enabled

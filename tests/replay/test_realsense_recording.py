@@ -153,7 +153,7 @@ def test_a_slow_reader_loses_nothing(tmp_path: Path) -> None:
     numbers = []
     for read_n in range(count):
         if read_n % 10 == 3:
-            time.sleep(0.3)
+            time.sleep(0.3)  # the slow reader
         frame = camera.read(5.0)
         numbers.append((frame.color_number, frame.depth_number))
     with pytest.raises(EndOfFrames):
