@@ -119,12 +119,12 @@ class ElectrakActuator:
     # -- life -------------------------------------------------------------------------------------------------------
 
     async def open(self) -> None:
-        """closed -> standby: wake the device with motion disabled and wait for its first feedback.
+        """closed -> standby: claim our address, wake the device with motion disabled, wait for its first feedback.
 
         Raises:
             LifecycleError: it is open already.
             DeviceMissingError: the channel does not exist.
-            DeviceTimeoutError: no feedback within three seconds.
+            DeviceTimeoutError: no address or no feedback within three seconds.
         """
         if self._lifecycle is not Lifecycle.CLOSED:
             raise LifecycleError(self.name, f"cannot open while {self._lifecycle}", "Close it first")
@@ -254,8 +254,11 @@ class ElectrakActuator:
         self._track.take(feedback, now_s)
         self._thermal.update(feedback.current_a, now_s)
         self._planner.on_feedback(self._track.motion(now_s))
-        self._heard.set()
-        if self._track.good_n >= RECOVERY_N:
+        # A unit that is still awake from before is heard before we may speak; until then it is not ours to arm.
+        may_speak = self._link.address is not None
+        if may_speak:
+            self._heard.set()
+        if self._track.good_n >= RECOVERY_N and may_speak:
             self._faults.clear("no_feedback", "wrong_address")
         if self._track.good_n >= TRUST_N:
             self._faults.clear("implausible_feedback")
@@ -373,11 +376,10 @@ class ElectrakActuator:
     def _no_feedback_error(self) -> DeviceError:
         now_s = self._clock.now_s()
         strangers = self._link.feedback_strangers(now_s)
+        cause = f"no feedback from address {self.address}"
         remedy = "Check its supply, the 120 ohm terminators and address_n"
         if strangers:
             remedy = f"Actuators are heard at address {', '.join(map(str, strangers))}: check address_n and select pins"
         if self._link.address is None:
-            remedy = "graderd got no J1939 address: look at the can faults"
-        return DeviceTimeoutError(
-            self.name, f"no feedback from address {self.address} within {WAKE_TIMEOUT_S:.0f} s", remedy
-        )
+            cause, remedy = "graderd got no J1939 address", "Look at the can faults"
+        return DeviceTimeoutError(self.name, f"{cause} within {WAKE_TIMEOUT_S:.0f} s", remedy)

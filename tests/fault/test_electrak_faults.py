@@ -10,10 +10,12 @@ from dataclasses import dataclass, field
 import pytest
 
 from drivers.electrak import ElectrakActuator
+from drivers.electrak.j1939.ids import Frame, Pgn, make_id
 from drivers.electrak.profile import load_profile
 from drivers.electrak.virtual import VirtualElectrak
 from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.settings import CanSettings
 from tests.electrak_sim import Machine, SimulatedLoop, run_simulated
 
 LEFT = ("lift_left",)
@@ -314,5 +316,50 @@ def test_arming_is_refused_while_the_overload_flag_is_still_set() -> None:
             await asyncio.sleep(0.3)
             with pytest.raises(DeviceRefusedError, match="overload"):
                 await axis.arm()
+
+    run_simulated(main)
+
+
+def test_a_unit_still_awake_is_ready_only_once_we_may_speak() -> None:
+    """As after a restart of the daemon: feedback is heard at once, our address is ours a quarter of a second later."""
+
+    async def main(loop: SimulatedLoop) -> None:
+        async with Machine(loop, names=LEFT) as machine:
+            axis = machine.axes["lift_left"]
+            await axis.close()
+            await machine.link.close()
+            await axis.open()
+            assert machine.link.address is not None
+            await axis.arm()
+
+    run_simulated(main)
+
+
+def test_opening_without_an_address_says_so() -> None:
+    async def main(loop: SimulatedLoop) -> None:
+        settings = CanSettings(interface="virtual", name_arbitrary_address=False)
+        async with Machine(loop, names=LEFT, can=settings) as machine:
+            axis = machine.axes["lift_left"]
+            await axis.close()
+            machine.bus.send(Frame(make_id(6, Pgn.ADDRESS_CLAIMED, settings.source_address_n), bytes(8)))
+            await asyncio.sleep(0.01)
+            with pytest.raises(DeviceTimeoutError, match="no J1939 address"):
+                await axis.open()
+            assert state(axis) is Lifecycle.CLOSED
+
+    run_simulated(main)
+
+
+def test_after_a_lost_bus_an_axis_is_back_only_once_we_may_speak() -> None:
+    async def main(loop: SimulatedLoop) -> None:
+        async with Machine(loop, names=LEFT) as machine:
+            axis = machine.axes["lift_left"]
+            machine.bus.unplug()
+            await asyncio.sleep(0.001)
+            assert state(axis) is Lifecycle.FAILED
+            while state(axis) is Lifecycle.FAILED:
+                await asyncio.sleep(0.005)
+            assert machine.link.address is not None
+            await axis.arm()
 
     run_simulated(main)
