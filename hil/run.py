@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 
 from hil import uml
+from hil.kernel import VIRTUAL_TIME, virtual_time_kernel
 from hil.shutdown import judge
 from hil.suite import PARTS
 
@@ -35,6 +36,15 @@ class Part:
     name: str
     timeout_s: float
     place_n: int
+
+
+@dataclass(frozen=True, slots=True)
+class Kernel:
+    """What the guests boot, with what on its command line, and how much longer than real time a run may take."""
+
+    path: Path = uml.KERNEL
+    arguments: tuple[str, ...] = ()
+    patience: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,14 +97,20 @@ def can_run_here() -> str:
     return "" if can_make_vcan() else "the kernel makes no vcan"
 
 
-def in_guest(part: Part, package: Path, tree: Path, *, follow: bool) -> int:
+def in_guest(part: Part, package: Path, tree: Path, kernel: Kernel, *, follow: bool) -> int:
     """Run one part in a guest; its log, journal and console stay under var/hil/PART."""
     command = (str(PYTHON), "-m", "hil.suite", part.name, str(package), str(tree))
     out = RESULTS / part.name
     shutil.rmtree(out, ignore_errors=True)
-    status = uml.Guest(command, out, directory=PROJECT, timeout_s=part.timeout_s, place_n=part.place_n).run(
-        follow=follow
-    )
+    status = uml.Guest(
+        command,
+        out,
+        directory=PROJECT,
+        timeout_s=part.timeout_s * kernel.patience,
+        kernel=kernel.path,
+        kernel_args=kernel.arguments,
+        place_n=part.place_n,
+    ).run(follow=follow)
     if status in (uml.TIMED_OUT, uml.GUEST_DIED):
         sys.stderr.write(
             f"hil: {part.name}: {'timed out' if status == uml.TIMED_OUT else 'the guest died'}; see {out}\n"
@@ -113,17 +129,17 @@ def judge_shutdown(part: Part) -> int:
     return 1 if wrong else 0
 
 
-def in_guests(package: Path, wanted: str, soak_s: float) -> list[int]:
+def in_guests(package: Path, wanted: str, soak_s: float, kernel: Kernel) -> list[int]:
     """The parts in two guests, side by side where there are two processors; the second's log after the first's."""
     work = Part("work", 900.0, 0)
     endurance = Part("soak" if wanted == "soak" else "endurance", soak_s + 600.0, 1)
     tree = unpacked(package)
     if wanted in ("soak", "endurance"):
-        return [in_guest(endurance, package, tree, follow=True)]
+        return [in_guest(endurance, package, tree, kernel, follow=True)]
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="guest") as pool:
-        run_second = partial(in_guest, endurance, package, tree, follow=False)
+        run_second = partial(in_guest, endurance, package, tree, kernel, follow=False)
         beside = pool.submit(run_second) if wanted == "all" and len(os.sched_getaffinity(0)) > 1 else None
-        results = [in_guest(work, package, tree, follow=True), judge_shutdown(work)]
+        results = [in_guest(work, package, tree, kernel, follow=True), judge_shutdown(work)]
         if wanted == "all":
             results.append(beside.result() if beside else run_second())
             sys.stdout.write((RESULTS / endurance.name / "log").read_text(encoding="utf-8", errors="replace"))
@@ -151,22 +167,30 @@ def main() -> int:
     parser.add_argument("--part", choices=PARTS, default="all", help="endurance: crashes and the soak; work: the rest")
     parser.add_argument("--soak-s", type=float, default=120.0, help="length of the soak in seconds")
     parser.add_argument("--guest", action="store_true", help="in a guest even where it could run here")
+    parser.add_argument(
+        "--virtual-time", action="store_true", help="in guests whose clock waits for them (see hil.kernel)"
+    )
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="so many runs in a row, all of them")
     parser.add_argument("--possible", action="store_true", help="only say whether it can run on this machine")
     options = parser.parse_args()
     os.environ["GRADERD_SOAK_S"] = str(options.soak_s)
-    why = "asked for" if options.guest else can_run_here()
+    why = "asked for" if options.guest or options.virtual_time else can_run_here()
     if options.possible or (why and uml.missing()):
         problem = uml.cannot() if why else ""
         sys.stderr.write(f"hil: cannot run here: {why}; {problem}\n" if problem else "")
         return uml.GUEST_DIED if problem else 0
     package = newest_package(RESULTS / "dist")
+    kernel = Kernel()
+    if options.virtual_time:
+        kernel = Kernel(virtual_time_kernel(RESULTS / "cache"), (VIRTUAL_TIME,), 4.0)
     sys.stdout.write(f"hil: in user-mode Linux ({why})\n" if why else "hil: on this machine's own kernel\n")
     sys.stdout.flush()
     verdicts: list[Verdict] = []
     for number in range(1, options.repeat + 1):
         began_s = time.monotonic()
-        results = in_guests(package, options.part, options.soak_s) if why else on_this_machine(package, options.part)
+        results = (
+            in_guests(package, options.part, options.soak_s, kernel) if why else on_this_machine(package, options.part)
+        )
         verdict = Verdict(next((status for status in results if status), 0), time.monotonic() - began_s)
         verdicts.append(verdict)
         if verdict.status:

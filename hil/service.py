@@ -354,4 +354,10 @@ def new_pass(grader: Grader, rig: Rig, zone: str, seed: int) -> None:
 def turn(grader: Grader, rig: Rig) -> None:
     """Evenly spread soil, which sends the blade to +45 deg; returns while it turns."""
     new_pass(grader, rig, "even", 6)
-    grader.wait("turning", lambda s: abs(s["axes"]["rotation"]["velocity_per_s"] or 0) > 2.0, 40.0)
+
+    def turning(status: Status) -> bool:
+        rotation = status["axes"]["rotation"]
+        # Well away from 0, where the way there may not quite have ended.
+        return (rotation["velocity_per_s"] or 0.0) > 2.0 and rotation["measured"] > 5.0
+
+    grader.wait("turning", turning, 40.0)

@@ -140,7 +140,7 @@ def resident_mib(unit: Unit) -> float:
     raise AssertionError("no VmRSS")
 
 
-def test_soak(ready: Grader, rig: Rig) -> None:
+def test_soak(ready: Grader, rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     soak = Soak(ready, rig)
     soak.scene()
     pid, began_s = ready.unit.pid, time.monotonic()
@@ -162,6 +162,7 @@ def test_soak(ready: Grader, rig: Rig) -> None:
     after_mib = resident_mib(ready.unit)
     grew = f"{before_mib or 0:.0f} -> {after_mib:.0f} MiB"
     report = f"soak: {SOAK_S:g} s, {sum(soak.done.values())} faults {soak.done}, {grew}"
-    print(report)  # noqa: T201  (part of the report of the run)
+    with capsys.disabled():
+        print(f"\n{report}")  # noqa: T201  (part of the report of the run)
     assert before_mib is not None, "too few faults for the time"
     assert after_mib - before_mib < GROWTH_MIB, report
