@@ -29,6 +29,9 @@ from graderd.hal.reading import Reading
 from graderd.hal.settings import ActuatorSettings
 
 WAKE_TIMEOUT_S: Final = 3.0
+_SILENCE_S: Final = 1.0
+_WAKING_S: Final = 0.5
+"""A claim so soon after our first message of a while is that of a unit which fell asleep meanwhile."""
 _CLOSE_REPEATS_N: Final = 3
 
 
@@ -64,6 +67,8 @@ class ElectrakActuator:
         self._track = FeedbackTrack(figures)
         self._heard = asyncio.Event()
         self._target_at_s = 0.0
+        self._control_at_s = -math.inf
+        self._resumed_at_s = -math.inf
         self._sent: Reading[float] | None = None
         self._sent_enabled = False
         self._overload = OverloadPolicy(settings.overload_retries_n)
@@ -223,6 +228,9 @@ class ElectrakActuator:
 
     def control_data(self, now_s: float) -> bytes:
         """The control message that goes out now."""
+        if now_s - self._control_at_s > _SILENCE_S:
+            self._resumed_at_s = now_s
+        self._control_at_s = now_s
         self._watch(now_s)
         control = self._next_control(now_s)
         self._sent_enabled = control.motion_enable
@@ -254,11 +262,12 @@ class ElectrakActuator:
         self._track.take(feedback, now_s)
         self._thermal.update(feedback.current_a, now_s)
         self._planner.on_feedback(self._track.motion(now_s))
-        # A unit that is still awake from before is heard before we may speak; until then it is not ours to arm.
-        may_speak = self._link.address is not None
-        if may_speak:
+        if self._link.address is None:
+            # Still awake from before, and about to sleep: what is heard while we may not speak is no answer to us.
+            self._track.good_n = 0
+        else:
             self._heard.set()
-        if self._track.good_n >= RECOVERY_N and may_speak:
+        if self._track.good_n >= RECOVERY_N:
             self._faults.clear("no_feedback", "wrong_address")
         if self._track.good_n >= TRUST_N:
             self._faults.clear("implausible_feedback")
@@ -267,7 +276,7 @@ class ElectrakActuator:
 
     def on_claim(self, name: int, solicited: bool, now_s: float) -> None:
         """An address claim from this address: an unasked one of a unit that was awake means that it restarted."""
-        awake = self._track.age_s(now_s) < 2.0
+        awake = self._track.age_s(now_s) < 2.0 and now_s - self._resumed_at_s > _WAKING_S
         moved_in = self._claimed_name is not None and name != self._claimed_name
         self._claimed_name = name
         if self._lifecycle is Lifecycle.CLOSED or (solicited and not moved_in) or not awake:

@@ -363,3 +363,24 @@ def test_after_a_lost_bus_an_axis_is_back_only_once_we_may_speak() -> None:
             await axis.arm()
 
     run_simulated(main)
+
+
+def test_a_unit_that_fell_asleep_while_the_bus_was_away_has_not_restarted() -> None:
+    """It sleeps five seconds after our last message; whatever it was about to do, armed is armed afterwards."""
+
+    async def main(loop: SimulatedLoop) -> None:
+        async with Machine(loop, names=LEFT) as machine:
+            axis = machine.axes["lift_left"]
+            for away_s in (4.65 + 0.002 * n for n in range(75)):
+                await machine.link.close()
+                await asyncio.sleep(away_s)
+                await machine.link.open()
+                machine.link.node.claim_requested_at_s = -1e9  # as where the answer comes late
+                while state(axis) is not Lifecycle.STANDBY:
+                    await asyncio.sleep(0.005)
+                await axis.arm()
+                await machine.drive({"lift_left": 100.0}, 1.0)
+                assert state(axis) is Lifecycle.ACTIVE, f"away {away_s:.3f} s: {conditions(axis)}"
+                await axis.disarm()
+
+    run_simulated(main)
