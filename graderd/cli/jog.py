@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 RENEW_S = 0.1
 REPLY_S = 2.0
 SETTLED_S = 0.3
+HELD_S = 1.0
 TOLERANCE = {"deg": 0.6, "mm": 2.5}
 VALUE = re.compile(r"(?P<absolute>=)?(?P<sign>[+-])?(?P<number>\d{1,6}(\.\d{0,9})?|\.\d{1,9})\s*(?P<unit>[^\d\s.]*)")
 
@@ -128,7 +129,7 @@ def move(
     """Send a jog or preset and keep its lease until the axes have arrived, ``hold_s`` is over, or Ctrl-C.
 
     Raises:
-        CliError: refused, lost on the way, or not arrived within ``timeout_s``.
+        CliError: refused, lost or held on the way, or not arrived within ``timeout_s``.
     """
     name = command["command"]
     interrupted = False
@@ -147,6 +148,10 @@ def move(
                 arrived = status is not None and arrival.update(status)
                 if elapsed_s >= hold_s if hold_s is not None else arrived:
                     break
+                if arrival.held_by is not None:
+                    fault = arrival.held_by
+                    why = f"held on its way: {fault['detail'] or fault['reads']} ({arrival.where()})"
+                    raise CliError(name, why, fault["remedy"])
                 if elapsed_s >= timeout_s:
                     raise CliError(name, f"not there after {timeout_s:g} s: {arrival.where()}", "see graderd status")
                 time.sleep(RENEW_S)
@@ -168,13 +173,18 @@ def move(
 
 
 class Arrival:
-    """Whether the axes are where they were asked to go, and have been for ``SETTLED_S``."""
+    """Whether the axes are where they were asked to go, and have been for ``SETTLED_S``.
+
+    ``held_by``: the fault for which the daemon has held all of them for ``HELD_S``; None where there is none.
+    """
 
     def __init__(self, axes: tuple[str, ...], since_s: float) -> None:
         self._axes = axes
         self._since_s = since_s
         self._there_since_s: float | None = None
+        self._held_since_s: float | None = None
         self.arrived = False
+        self.held_by: dict[str, Any] | None = None
         self.measured: dict[str, float | None] = {}
         self._texts: list[str] = []
 
@@ -191,7 +201,17 @@ class Arrival:
         elif self._there_since_s is None:
             self._there_since_s = status["time_s"]
         self.arrived = self._there_since_s is not None and status["time_s"] - self._there_since_s >= SETTLED_S
+        self._note_hold(status, bool(asked) and all(axis["limited"] is None for axis in asked))
         return self.arrived
+
+    def _note_hold(self, status: dict[str, Any], held: bool) -> None:
+        mine = [f for f in status["faults"] if f["present"] and f["name"].split(".")[0] in self._axes]
+        if not held or not mine:
+            self._held_since_s = None
+        elif self._held_since_s is None:
+            self._held_since_s = status["time_s"]
+        enough = self._held_since_s is not None and status["time_s"] - self._held_since_s >= HELD_S
+        self.held_by = mine[0] if enough else None
 
     def where(self) -> str:
         """Where the axes are, for people."""

@@ -18,7 +18,15 @@ from graderd.core import commands as cmd
 from graderd.core.faults import ActiveFault
 from graderd.core.machine import Goals, Inputs, Lease, MachineSettings, Mode, Pose, State, Unmet, step
 from graderd.core.rule import RuleSettings
-from graderd.core.status import AttitudeStatus, AxisStatus, LeaseStatus, RequirementStatus, SoilStatus, Status
+from graderd.core.status import (
+    AttitudeStatus,
+    AxisStatus,
+    FaultStatus,
+    LeaseStatus,
+    RequirementStatus,
+    SoilStatus,
+    Status,
+)
 from graderd.hal.lifecycle import Lifecycle
 from tests.patience import PatientClock
 
@@ -32,7 +40,9 @@ JPEG = b"\xff\xd8\xff\xe0 not much of a picture \xff\xd9"
 
 @dataclass
 class FakeDaemon:
-    """Implements DaemonPort. ``frozen`` keeps commands unanswered; ``late_s`` records how late ticks came."""
+    """Implements DaemonPort. ``frozen`` keeps commands unanswered; ``late_s`` records how late ticks came; the axes
+    ``held`` do not move, for the faults there.
+    """
 
     settings: MachineSettings = field(default_factory=MachineSettings)
     unmet: tuple[Unmet, ...] = ()
@@ -41,6 +51,7 @@ class FakeDaemon:
     frozen: bool = False
     late_s: list[float] = field(default_factory=list)
     seen: list[cmd.Command] = field(default_factory=list)
+    held: dict[str, FaultStatus] = field(default_factory=dict)
     bus_watched_n: int = 0
     state: State = field(default_factory=State)
     positions: dict[str, float] = field(
@@ -149,7 +160,7 @@ class FakeDaemon:
         }
         self._moving = set()
         for axis, goal in goals.items():
-            if goal is None:
+            if goal is None or axis in self.held:
                 continue
             reach, way = SPEED_PER_S[axis] * TICK_S, goal - self.positions[axis]
             self.positions[axis] += max(-reach, min(reach, way))
@@ -202,7 +213,7 @@ class FakeDaemon:
                 unit="deg" if name == "rotation" else "mm",
                 lifecycle=lifecycle,
                 requested=requested[name],
-                limited=requested[name],
+                limited=None if name in self.held else requested[name],
                 sent=requested[name],
                 measured=position,
                 measured_age_s=0.01,
@@ -224,6 +235,7 @@ class FakeDaemon:
             last_stop=self.state.reason if self.state.mode is Mode.STOPPED else "",
             soil=SoilStatus(),
             axes=axes,
+            faults=tuple(self.held.values()),
             attitude=AttitudeStatus(height_mm=self.positions["lift_left"] - 100.0, slope_deg=0.0, pitch_deg=0.0),
             readiness=tuple(
                 RequirementStatus(name=u.name, met=False, mandatory=True, reason=u.reason, remedy=u.remedy)

@@ -7,6 +7,7 @@ import json
 import math
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -14,8 +15,9 @@ from hypothesis import strategies as st
 
 from graderd.api.settings import ApiLimits
 from graderd.cli.console import CliError
-from graderd.cli.jog import UNITS, VALUE, JogValue, parse_value
+from graderd.cli.jog import UNITS, VALUE, Arrival, JogValue, parse_value
 from graderd.core.machine import Mode
+from graderd.core.status import FaultStatus
 from tests.unit.api_daemon import FakeDaemon, serving, within
 from tests.unit.test_cli_modes import Capture, cli, command_line
 
@@ -122,6 +124,46 @@ async def test_refused_jogs_move_nothing(
         assert says in said
         assert said.count("\n") == 1
         assert daemon.positions == before
+
+
+def lifts(time_s: float, limited: float | None, *faults: str) -> dict[str, Any]:
+    """What the stream says of two lifts on their way to 130 mm."""
+    axis = {"unit": "mm", "measured": 110.0, "requested": 130.0, "limited": limited, "limited_because": "", "moving": 0}
+    axes = {name: {"name": name, **axis} for name in ("lift_left", "lift_right")}
+    present = [
+        {"name": n, "present": True, "detail": "7.7 mm apart", "reads": "", "remedy": "level it"} for n in faults
+    ]
+    return {"time_s": time_s, "axes": axes, "faults": present}
+
+
+def test_lifts_that_the_daemon_holds_for_a_fault_will_not_arrive() -> None:
+    arrival = Arrival(("lift_left", "lift_right"), 0.0)
+    apart = "lift_left.sides_apart"
+    # Side by side they are waited for: a fault of another axis, a short hold, a side that waits for the other.
+    for second, status in enumerate(
+        [lifts(1.0, None, "rotation.hot"), lifts(2.0, None, apart), lifts(2.9, None, apart), lifts(3.5, 120.0, apart)]
+    ):
+        arrival.update(status)
+        assert arrival.held_by is None, second
+    for time_s in (4.0, 4.6, 5.1):
+        assert not arrival.update(lifts(time_s, None, apart))
+    assert arrival.held_by is not None
+    assert arrival.held_by["remedy"] == "level it"
+
+
+async def test_a_jog_that_a_fault_holds_ends_and_says_why(tmp_path: Path, capsys: Capture) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        assert await cli(path, "arm") == 0
+        apart = FaultStatus(
+            name="lift_left.sides_apart", reads="the two lifts are apart", detail="lift_left does not move",
+            remedy="level the blade", reaction="retreat", clears="auto", age_s=0.5, present=True,
+        )  # fmt: skip
+        daemon.held = {"lift_left": apart, "lift_right": apart}
+        assert await cli(path, "jog", "height", "30mm") == 1
+        said = capsys.readouterr().err
+        assert "held on its way: lift_left does not move (lift_left 100.0 mm, lift_right 100.0 mm)" in said
+        assert "evel the blade" in said
+        await daemon.until(lambda: daemon.state.lease is None)
 
 
 async def test_the_lease_is_kept_for_as_long_as_asked(tmp_path: Path, capsys: Capture) -> None:
