@@ -21,6 +21,8 @@ from hil.run import PROJECT, RESULTS, newest_package
 SCRIPT = PROJECT / "tests" / "hil" / "lifecycle.sh"
 BASE = ("systemd", "systemd-sysv", "udev", "dbus", "kmod", "iproute2", "ca-certificates")
 NEWER = "99.0.0"
+PLACE = Path("root/hil")
+"""Where the root holds what we bring; its /tmp may be a file system in memory, mounted over what was laid there."""
 
 
 def clean_root(directory: Path, suite: str, mirror: str, include: Sequence[str] = BASE) -> None:
@@ -40,11 +42,12 @@ def apt_install(root: Path, package: Path) -> None:
     Raises:
         SystemExit: apt failed, or the root lacks something the package needs and does not say.
     """
-    shutil.copy(package, root / "tmp" / package.name)
+    (root / PLACE).mkdir()
+    shutil.copy(package, root / PLACE / package.name)
     shutil.copy("/etc/resolv.conf", root / "etc" / "resolv.conf")
     steps = (
         "mount -t proc proc /proc",
-        "cd /tmp",
+        f"cd /{PLACE}",
         "apt-get update -qq",
         f"apt-get install -y -qq --no-install-recommends ./{package.name}",
         "graderd --help",
@@ -99,10 +102,10 @@ def main() -> int:
         root = Path(scratch) / "root"
         clean_root(root, options.suite, options.mirror)
         apt_install(root, package)
-        shutil.copy(newer_version(package, Path(scratch)), root / "tmp" / "newer.deb")
-        shutil.copy(SCRIPT, root / "tmp" / SCRIPT.name)
+        shutil.copy(newer_version(package, Path(scratch)), root / PLACE / "newer.deb")
+        shutil.copy(SCRIPT, root / PLACE / SCRIPT.name)
         guest = uml.Guest(
-            ("/bin/sh", f"/tmp/{SCRIPT.name}", f"/tmp/{package.name}", "/tmp/newer.deb"),
+            ("/bin/sh", f"/{PLACE}/{SCRIPT.name}", f"/{PLACE}/{package.name}", f"/{PLACE}/newer.deb"),
             RESULTS / "package",
             directory=Path("/"),
             timeout_s=600.0,

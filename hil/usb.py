@@ -48,7 +48,7 @@ def serve(monitor_path: Path, ended: Event) -> None:
     while not ended.wait(0.1):
         for path in OUT.glob("please-*"):
             monitor = monitor or qemu.Monitor(monitor_path)
-            if path.name == "please-plug":
+            if path.name.startswith("please-plug-"):
                 monitor.ask("device_add", **ADAPTER, **{"always-plugged": True})
             else:
                 monitor.ask("device_del", id=ADAPTER["id"])

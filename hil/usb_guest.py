@@ -81,7 +81,8 @@ class Report:
 
 def host(request: str) -> None:
     """Let the host do something to this machine, and wait until it is done."""
-    path = OUT / f"please-{request}"
+    # A name of its own each time: the guest may still take one that the host removed for there.
+    path = OUT / f"please-{request}-{time.monotonic_ns()}"
     path.touch()
     wait_for(f"the host to {request}", lambda: not path.exists(), 30.0, 0.2)
 

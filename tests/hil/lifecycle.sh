@@ -76,7 +76,7 @@ step "purge leaves the recordings and nothing else"
 dpkg --purge graderd >/tmp/purge 2>&1 || fail "purge: $(cat /tmp/purge)"
 [ -f /var/lib/graderd/recordings/pass-1 ] || fail "the recording is gone"
 rm -r /var/lib/graderd
-left=$(find / -xdev -name '*graderd*' -not -path '/proc/*' -not -path '/sys/*' -not -path '/tmp/*' -not -path '/run/hil-out/*' \
+left=$(find / -xdev -name '*graderd*' -not -path '/proc/*' -not -path '/sys/*' -not -path '/root/hil/*' -not -path '/run/hil-out/*' \
     -not -path '/var/log/*' -not -path '/var/cache/*' -not -path '/run/log/*' 2>/dev/null || true)
 [ -z "$left" ] || fail "left behind: $left"
 if getent passwd graderd >/dev/null || getent group graderd >/dev/null; then fail "user or group left behind"; fi
