@@ -10,10 +10,10 @@ HIL_ARGS ?=
 BENCH_ARGS ?=
 SOAK_S ?= 900
 
-.PHONY: help run test faults deb hil soak soak-virtual-time hil-package hil-usb bench-hw check format lock clean
+.PHONY: help run test faults deb hil soak soak-virtual-time hil-package hil-arm64 hil-usb bench-hw check format lock clean
 
 help: ## list the targets
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
 
 $(STAMP): requirements.lock pyproject.toml
 	@echo "setting up $(VENV) (once; some minutes on a slow line)" >&2
@@ -46,7 +46,7 @@ soak: $(STAMP) ## the soak alone, SOAK_S seconds of it
 	@$(BIN)/python packaging/build_deb.py --system-python --out var/hil/dist
 	@PYTHONPATH=. $(BIN)/python -m hil.run --part soak --soak-s $(SOAK_S)
 
-soak-virtual-time: $(STAMP) ## the same in virtual time: no deadline is missed however busy this machine is (builds a kernel once)
+soak-virtual-time: $(STAMP) ## the same in virtual time: no deadline is missed on a busy machine (builds a kernel once)
 	@hil/setup --kernel
 	@$(BIN)/python packaging/build_deb.py --system-python --out var/hil/dist
 	@PYTHONPATH=. $(BIN)/python -m hil.run --part soak --soak-s $(SOAK_S) --virtual-time
@@ -55,6 +55,11 @@ hil-package: $(STAMP) ## install, use, upgrade, purge the package in a clean Deb
 	@hil/setup --usb
 	@$(MAKE) --no-print-directory deb
 	@PYTHONPATH=. $(BIN)/python -m hil.package $(HIL_ARGS)
+
+hil-arm64: $(STAMP) ## install and use the arm64 package in a bare arm64 root, emulated (not in every CI run)
+	@hil/setup --arm64
+	@$(MAKE) --no-print-directory deb DEB_ARGS="--arch arm64"
+	@PYTHONPATH=. $(BIN)/python -m hil.arm64
 
 hil-usb: $(STAMP) ## QEMU: an FTDI adapter pulled and plugged, two SJA1000 controllers (before a release; 5 minutes or so)
 	@hil/setup --usb

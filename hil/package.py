@@ -25,13 +25,16 @@ PLACE = Path("root/hil")
 """Where the root holds what we bring; its /tmp may be a file system in memory, mounted over what was laid there."""
 
 
-def clean_root(directory: Path, suite: str, mirror: str, include: Sequence[str] = BASE) -> None:
-    """A bare root in ``directory`` with a few packages.
+def clean_root(
+    directory: Path, suite: str, mirror: str, include: Sequence[str] = BASE, *, architecture: str = ""
+) -> None:
+    """A bare root in ``directory`` with a few packages, of this machine's architecture where none is given.
 
     Raises:
         SystemExit: mmdebstrap is not there or failed.
     """
     command = ["mmdebstrap", "--quiet", "--variant=minbase", "--mode=root", f"--include={','.join(include)}"]
+    command += [f"--architectures={architecture}"] if architecture else []
     if subprocess.run([*command, suite, str(directory), *([mirror] if mirror else [])], check=False).returncode:
         raise SystemExit("hil: no clean root: mmdebstrap failed")
 

@@ -112,9 +112,14 @@ def sections(state: dict[str, Any]) -> list[Section]:
     ]
     if faults:
         found.append(("Faults", ("fault", "reaction", "what", "detail", "what to do", ""), faults))
-    unmet: list[Row] = [(r["name"], r["reason"], r["remedy"]) for r in state["readiness"] if not r["met"]]
-    if unmet:
-        found.append(("Not ready to arm", ("requirement", "reason", "remedy"), unmet))
+    for title, mandatory in (("Not ready to arm", True), ("Missing; arming goes without", False)):
+        unmet: list[Row] = [
+            (r["name"], r["reason"], r["remedy"])
+            for r in state["readiness"]
+            if not r["met"] and r["mandatory"] is mandatory
+        ]
+        if unmet:
+            found.append((title, ("requirement", "reason", "remedy"), unmet))
     return found
 
 

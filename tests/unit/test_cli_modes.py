@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from graderd.cli.app import run_app
+from graderd.cli.status import sections
 from graderd.core.machine import Mode, Unmet
 from tests.unit.api_daemon import FakeDaemon, serving, within
 
@@ -84,6 +85,19 @@ async def test_status_for_people_shows_what_matters(tmp_path: Path, capsys: Capt
         for text in ("disarmed: started disarmed", "rotation", "lift_left", "0.0 deg", "camera fresh", "no picture"):
             assert text in out
         assert "\x1b" not in out
+
+
+async def test_what_arming_needs_and_what_it_goes_without_are_told_apart(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, _):
+        status = daemon.status().model_dump(mode="json")
+    status["readiness"] = [
+        {"name": "rotation", "met": False, "mandatory": True, "reason": "closed", "remedy": "check power"},
+        {"name": "camera", "met": False, "mandatory": False, "reason": "no frame", "remedy": "wait"},
+        {"name": "tilt", "met": True, "mandatory": True, "reason": "standby", "remedy": ""},
+    ]
+    tables = {title: rows for title, _, rows in sections(status)}
+    assert tables["Not ready to arm"] == [("rotation", "closed", "check power")]
+    assert tables["Missing; arming goes without"] == [("camera", "no frame", "wait")]
 
 
 async def test_watch_prints_one_object_a_line(tmp_path: Path) -> None:
