@@ -150,12 +150,17 @@ def wheels_for(package: Package, scratch: Path) -> dict[str, list[Path]]:
 
 
 def download(target: Target, pins: Sequence[Pin], scratch: Path) -> list[Path]:
-    """Let pip fetch the wheels of these pins for one Python."""
-    listing = scratch / f"requirements-{target.python}.txt"
-    listing.write_text("\n".join(pin.line() for pin in pins) + "\n", encoding="utf-8")
+    """Let pip fetch the wheels of these pins for one Python; two at a time, since it takes one after the other."""
     folder = scratch / f"wheels-{target.python}"
     options = ("--no-deps", "--require-hashes", *target.pip_options(), "--dest", folder)
-    pip("download", *options, "--requirement", listing)
+
+    def fetch(start_n: int) -> None:
+        listing = scratch / f"requirements-{target.python}-{start_n}.txt"
+        listing.write_text("\n".join(pin.line() for pin in pins[start_n::2]) + "\n", encoding="utf-8")
+        pip("download", *options, "--requirement", listing)
+
+    with ThreadPoolExecutor(thread_name_prefix="fetch") as pool:
+        list(pool.map(fetch, range(min(2, len(pins)))))
     return sorted(folder.glob("*.whl"))
 
 
@@ -319,7 +324,9 @@ def build(version: str, architecture: str, pythons: tuple[str, ...], folder: Pat
         package = Package(version, architecture, pythons, scratch / "tree")
         package.tree.mkdir(mode=0o755)
         os.umask(0o022)
-        make_environment(package, wheels_for(package, scratch), our_wheel(package, scratch))
+        with ThreadPoolExecutor(thread_name_prefix="wheel") as pool:
+            own = pool.submit(our_wheel, package, scratch)
+            make_environment(package, wheels_for(package, scratch), own.result())
         compile_bytecode(package)
         place_files(package)
         run("chmod", "-R", "u+rwX,go+rX,go-w", package.tree)

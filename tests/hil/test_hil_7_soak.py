@@ -142,8 +142,8 @@ def resident_mib(unit: Unit) -> float:
 
 def test_soak(ready: Grader, rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     soak = Soak(ready, rig)
-    soak.scene()
     pid, began_s = ready.unit.pid, time.monotonic()
+    soak.scene()
     before_mib: float | None = None
     names = sorted(soak.actions())
     while time.monotonic() - began_s < SOAK_S:
