@@ -212,23 +212,20 @@ def _bound(requested: float, limits: AxisLimits, armed_at: float) -> tuple[float
 def _advance(former: Setpoint, goal: float, limits: AxisLimits, dt_s: float) -> Setpoint:
     """Move the setpoint toward the goal as fast as speed, acceleration and the way to stop allow.
 
-    The speed from which it can still stop within the remaining way with ticks of ``dt_s`` is
-    ``a dt (sqrt(1/4 + 2 d / (a dt²)) - 1/2)``: the discrete form of ``sqrt(2 a d)``, so that it never overshoots.
-    A tick that comes late brakes late: where there was room to stop, the way ends at the goal all the same. Only a
-    goal that was moved nearer than the way to stop is passed, and come back to.
+    The new speed v leaves, after this tick, at least the v²/2a that stopping takes: ``d - v dt = v²/2a``, solved for v.
+    So a goal that stands is never passed, however unevenly the ticks come; only one that was moved nearer than the way
+    to stop is, and come back to.
     """
     if dt_s <= 0.0:
         return former
     distance = goal - former.position
     step_speed = limits.acceleration * dt_s
-    stoppable = step_speed * (math.sqrt(0.25 + 2.0 * abs(distance) / (step_speed * dt_s)) - 0.5)
+    stoppable = step_speed * (math.sqrt(1.0 + 2.0 * abs(distance) / (step_speed * dt_s)) - 1.0)
     wanted = math.copysign(min(limits.speed, stoppable), distance)
     speed = min(max(wanted, former.speed - step_speed), former.speed + step_speed)
     position = former.position + speed * dt_s
     near = abs(goal - position) <= step_speed * dt_s and abs(speed) <= 2.0 * step_speed
-    arrived = near and abs(distance) <= limits.speed * dt_s
-    passed = (position - goal) * distance > 0.0 and former.speed**2 <= 2.0 * limits.acceleration * abs(distance)
-    if arrived or passed:
+    if near and abs(distance) <= limits.speed * dt_s:
         return replace(former, position=goal, speed=0.0)
     return replace(former, position=position, speed=speed)
 

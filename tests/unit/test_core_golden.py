@@ -32,7 +32,7 @@ from graderd.core.faults import (
     update_faults,
     worst,
 )
-from graderd.core.gate import AXES, GateInputs, GateSettings, GateState, pass_gate
+from graderd.core.gate import AXES, GateInputs, GateSettings, GateState, Setpoint, pass_gate
 from graderd.core.machine import Goals, MachineSettings, Mode, Pose, State, Step, Unmet, step
 from graderd.core.rule import RuleSettings
 from graderd.core.zones import SoilObservation, Zone
@@ -165,6 +165,33 @@ def gate_answers() -> Iterator[tuple[str, Any]]:
         yield f"{name}, {mode}, lease {lease_ok}", plain(rows)
 
 
+def late_answers() -> Iterator[tuple[str, Any]]:
+    """Ticks of uneven length, on the way to a goal that stands and to one nearer than the way to stop."""
+    pose = Pose(0.0, 100.0, 100.0, 50.0)
+    settings = GateSettings()
+    for goal_deg, pattern in product((35.0, -12.0, 0.4), ((0.02, 0.2), (0.001, 0.08, 0.02), (0.2,), (0.02, 0.021))):
+        state, rows = GateState(), []
+        for tick in range(60):
+            inputs = GateInputs(settings, Mode.MANUAL, pose, pattern[tick % len(pattern)], True)
+            state, passed = pass_gate(state, Goals(goal_deg), inputs)
+            rows.append(passed["rotation"].limited)
+        yield f"to {goal_deg} with ticks of {pattern}", plain(rows)
+    limits = settings.limits()["rotation"]
+    shares = (0.02, 0.1, 0.3, 0.5, 0.8, 0.99, 1.0, 1.05, 1.4, 3.0)
+    for share, speed, dt_s in product(shares, (0.3, 0.9, 1.5, -6.0), (0.02, 0.1, 0.2)):
+        way_deg = math.copysign(share * speed**2 / (2.0 * limits.acceleration), speed)
+        state = GateState({"rotation": Setpoint(0.0, speed, 0.0)})
+        state, _ = pass_gate(state, Goals(way_deg), GateInputs(settings, Mode.MANUAL, pose, dt_s, True))
+        # ending at the goal and passing it are told apart by the speed that is left
+        yield f"{share} of the way to stop from {speed}, {dt_s}", plain(asdict(state.setpoints["rotation"]))
+    for speed, goal_deg in ((9.0, 70.0), (-9.0, -70.0), (9.0, 60.0)):
+        near = math.copysign(59.9, goal_deg)
+        state = GateState({"rotation": Setpoint(near, speed, near)})
+        there = Pose(near, 100.0, 100.0, 50.0)
+        state, _ = pass_gate(state, Goals(goal_deg), GateInputs(settings, Mode.MANUAL, there, 0.2, True))
+        yield f"at the limit with {speed}, to {goal_deg}", plain(asdict(state.setpoints["rotation"]))
+
+
 def bound_answers() -> Iterator[tuple[str, Any]]:
     """A window that ends exactly where the limit is: the limit is named."""
     settings = GateSettings(rotation_window_deg=60.0)
@@ -232,7 +259,7 @@ def fault_answers() -> Iterator[tuple[str, Any]]:
 
 def answers() -> dict[str, Any]:
     found: dict[str, Any] = {}
-    for part in (machine_answers, automatic_answers, gate_answers, bound_answers, fault_answers):
+    for part in (machine_answers, automatic_answers, gate_answers, late_answers, bound_answers, fault_answers):
         for key, value in part():
             assert key not in found, key
             found[key] = value
