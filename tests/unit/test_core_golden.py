@@ -184,12 +184,17 @@ def late_answers() -> Iterator[tuple[str, Any]]:
         state, _ = pass_gate(state, Goals(way_deg), GateInputs(settings, Mode.MANUAL, pose, dt_s, True))
         # ending at the goal and passing it are told apart by the speed that is left
         yield f"{share} of the way to stop from {speed}, {dt_s}", plain(asdict(state.setpoints["rotation"]))
-    for speed, goal_deg in ((9.0, 70.0), (-9.0, -70.0), (9.0, 60.0)):
-        near = math.copysign(59.9, goal_deg)
+    for goal_deg, dt_s in product((70.0, -70.0, 60.0), (0.01, 0.02, 0.2)):
+        near, speed = math.copysign(59.9, goal_deg), math.copysign(limits.speed, goal_deg)
         state = GateState({"rotation": Setpoint(near, speed, near)})
         there = Pose(near, 100.0, 100.0, 50.0)
-        state, _ = pass_gate(state, Goals(goal_deg), GateInputs(settings, Mode.MANUAL, there, 0.2, True))
-        yield f"at the limit with {speed}, to {goal_deg}", plain(asdict(state.setpoints["rotation"]))
+        state, _ = pass_gate(state, Goals(goal_deg), GateInputs(settings, Mode.MANUAL, there, dt_s, True))
+        yield f"fast at the limit, to {goal_deg}, {dt_s}", plain(asdict(state.setpoints["rotation"]))
+    for part, dt_s in product((0.99, 1.01, 1.05, 1.2), (0.2, 0.5, 1.0)):
+        state = GateState({"rotation": Setpoint(0.0, limits.speed, 0.0)})
+        goals = Goals(part * limits.speed * dt_s)
+        state, _ = pass_gate(state, goals, GateInputs(settings, Mode.MANUAL, pose, dt_s, True))
+        yield f"{part} of a tick's way in {dt_s}", plain(asdict(state.setpoints["rotation"]))
 
 
 def bound_answers() -> Iterator[tuple[str, Any]]:
