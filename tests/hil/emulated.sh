@@ -1,6 +1,6 @@
 #!/bin/sh
 # The installed package on a processor of another kind, emulated: daemon and rig come up, arm, turn, lift, disarm.
-# Pictures are too slow there to be judged in time; that the daemon says so is part of it. Run by hil/arm64.py, as root.
+# Pictures are too slow there to be judged in time, so automatic operation is left out. Run by hil/arm64.py, as root.
 set -eu
 say() { echo "arm64: $*"; }
 fail() { say "FAILED: $*"; tail -5 /root/daemon.log; exit 1; }
