@@ -23,7 +23,8 @@ import cv2
 import numpy as np
 
 from drivers.rig.dataset import export
-from graderd.perception import METHODS, Method, PerceptionSettings, make_classifier
+from graderd.perception import METHODS, Method, PerceptionSettings
+from graderd.perception.classifier import make_classifier
 from graderd.perception.frame_set import FrameSet
 from graderd.perception.scoring import Score
 

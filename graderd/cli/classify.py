@@ -16,7 +16,7 @@ from graderd.hal.errors import DeviceError, ProtocolError
 
 if TYPE_CHECKING:
     from graderd.hal.camera import Camera, Frame
-    from graderd.perception import Classifier
+    from graderd.perception.classifier import Classifier
     from graderd.perception.frame_set import Entry
     from graderd.perception.scoring import Score
 
@@ -202,7 +202,7 @@ class Run:
 
     def _classifier_for(self, frame: Frame) -> Classifier:
         from graderd.core.blade import BladeGeometry
-        from graderd.perception import make_classifier
+        from graderd.perception.classifier import make_classifier
 
         has_depth = frame.depth_mm is not None
         method = self._method

@@ -3,9 +3,11 @@
 Four classifiers share one contract: ``paper`` (the letter of the paper's section 3.2), ``fast_color`` (the same rule on
 the blade's region), ``depth`` (litres per third above a ground fitted in every frame) and ``fused`` (depth decides,
 colour cross-checks; the default).
+
+What is imported here needs no OpenCV: the daemon and the guard read their settings without its 150 MB of libraries. The
+classifiers are in :mod:`graderd.perception.classifier`.
 """
 
-from graderd.perception.classifier import Classifier, make_classifier
 from graderd.perception.settings import METHODS, CameraCalibration, Method, PerceptionSettings
 
-__all__ = ["METHODS", "CameraCalibration", "Classifier", "Method", "PerceptionSettings", "make_classifier"]
+__all__ = ["METHODS", "CameraCalibration", "Method", "PerceptionSettings"]

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from graderd.core.zones import PictureFault, SoilObservation, Zone
 from graderd.hal.camera import Frame
-from graderd.perception.classifier import Classifier
 from graderd.perception.settings import DecisionSettings
+
+if TYPE_CHECKING:
+    from graderd.perception.classifier import Classifier  # not at run time: the daemon asks here for `usable` alone
 
 NEVER_S = 3600.0
 """Age given to an angle that was never measured: finite, so that it survives JSON."""

@@ -12,7 +12,8 @@ import pytest
 from graderd.core.blade import BladeGeometry
 from graderd.core.zones import Zone
 from graderd.hal.camera import Frame
-from graderd.perception import METHODS, CameraCalibration, Method, PerceptionSettings, make_classifier
+from graderd.perception import METHODS, CameraCalibration, Method, PerceptionSettings
+from graderd.perception.classifier import make_classifier
 from tests.perception_scenes import Scene, render
 
 PILES = [Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN, Zone.NONE]

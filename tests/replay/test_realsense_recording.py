@@ -15,7 +15,8 @@ from graderd.core.zones import Zone
 from graderd.hal.camera import EndOfFrames, Frame
 from graderd.hal.errors import DeviceMissingError, DeviceTimeoutError, LifecycleError
 from graderd.hal.settings import CameraSettings
-from graderd.perception import CameraCalibration, PerceptionSettings, make_classifier
+from graderd.perception import CameraCalibration, PerceptionSettings
+from graderd.perception.classifier import make_classifier
 from tests.perception_scenes import Scene, render
 from tests.realsense_devices import Color, Depth, SoftD455, record
 

@@ -175,6 +175,13 @@ def test_the_module_and_the_command_are_the_same(tmp_path: Path) -> None:
     assert run.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("module", ["graderd.runtime.app.guard", "graderd.runtime.app.daemon"])
+def test_daemon_and_guard_load_no_opencv(module: str) -> None:
+    code = f"import sys, {module}; sys.exit('cv2' in sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False)
+    assert run.returncode == 0, run.stderr
+
+
 def test_stop_does_not_wait_for_large_imports() -> None:
     code = (
         "import sys, graderd.cli.app as app; app.run_app(['--socket', 'none', 'stop']);"

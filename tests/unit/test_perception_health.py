@@ -20,7 +20,8 @@ from graderd.core.blade import BladeGeometry
 from graderd.core.zones import SoilObservation, Zone
 from graderd.hal.camera import Frame
 from graderd.hal.settings import CameraSettings
-from graderd.perception import METHODS, CameraCalibration, Classifier, Method, PerceptionSettings, make_classifier
+from graderd.perception import METHODS, CameraCalibration, Method, PerceptionSettings
+from graderd.perception.classifier import Classifier, make_classifier
 from tests.perception_scenes import PoseError, Scene, render
 
 ANGLE_DEG = 10.0

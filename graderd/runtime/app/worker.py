@@ -23,7 +23,7 @@ from pydantic import BaseModel, ValidationError
 from graderd.hal.camera import Camera, EndOfFrames, Frame, Intrinsics
 from graderd.hal.errors import DeviceError, DeviceTimeoutError
 from graderd.hal.settings import CameraSettings
-from graderd.perception import Classifier, make_classifier
+from graderd.perception.classifier import Classifier, make_classifier
 from graderd.perception.frame_set import Entry, FrameSetWriter
 from graderd.perception.pipeline import judge_frame
 from graderd.perception.settings import CameraCalibration, StreamCalibration
