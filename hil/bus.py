@@ -187,6 +187,22 @@ class KernelNode:
         return None
 
 
+def daemons_claim(listener: RawBus, timeout_s: float = 3.0) -> tuple[int, int]:
+    """Address and NAME of the next claim that is the daemon's (industry group 3: construction).
+
+    Raises:
+        AssertionError: none came in time.
+    """
+    until_s = time.monotonic() + timeout_s
+    while time.monotonic() < until_s:
+        frame = listener.receive(0.2)
+        if frame is not None and frame.pgn == ADDRESS_CLAIMED and len(frame.data) == 8:
+            name = int.from_bytes(frame.data, "little")
+            if (name >> 60) & 7 == 3:
+                return frame.source, name
+    raise AssertionError(f"no claim of the daemon within {timeout_s:g} s")
+
+
 def couple(one: str, other: str) -> None:
     """Let every frame of one interface appear on the other, by the kernel's CAN gateway; ends with either of them."""
     for source, destination in ((one, other), (other, one)):

@@ -22,6 +22,11 @@ RIG_DIRECTORY: Final = Path("/run/hil-rig")
 PYTHON: Final = "/opt/graderd/bin/python"
 # SD_MESSAGE_UNIT_RESTART_SCHEDULED of <systemd/sd-messages.h>.
 RESTART_SCHEDULED: Final = "5eb03494b6584870a536b337290809b3"
+# Each status costs the one processor of a guest several milliseconds, which daemon and rig then do not have.
+ASK_EVERY_S: Final = 0.1
+# How soon a lost link is told, and how soon the service is ready again once the link is back.
+TOLD_S: Final = 1.0
+RECOVERED_S: Final = 8.0
 Status = dict[str, Any]
 
 
@@ -147,6 +152,7 @@ class Grader:
     def __init__(self) -> None:
         self.unit = Unit("graderd.service")
         self.api = Api()
+        self._settings: Mapping[str, object] = {}
 
     def configure(self, changes: Mapping[str, object]) -> None:
         """Set dotted keys in the installed configuration; comments stay."""
@@ -159,13 +165,16 @@ class Grader:
             table[key] = value
         CONFIG.write_text(tomlkit.dumps(document), encoding="utf-8")
 
-    def start_with(self, changes: Mapping[str, object]) -> Status:
-        """Start the service with changed settings, its units ordered anew after the devices these name."""
+    def run_with(self, settings: Mapping[str, object]) -> None:
+        """Let the service run with these settings, its units ordered after the devices they name; it may already."""
+        if settings == self._settings and self.unit.state == "active":
+            return
         # Stopped first: systemd reads its units slowly beside a busy service on one processor.
         self.unit.ctl("stop")
-        self.configure(changes)
+        self.configure(settings)
         run("systemctl", "daemon-reload")
-        return self.start()
+        self.start()
+        self._settings = dict(settings)
 
     def start(self, timeout_s: float = 60.0) -> Status:
         """Start (or restart) the service and wait until every axis can be read."""
@@ -192,7 +201,7 @@ class Grader:
             last = self.status_or_none()
             if last is not None and check(last):
                 return last
-            time.sleep(0.05)
+            time.sleep(ASK_EVERY_S)
         raise WaitError(f"{what}: not within {timeout_s:g} s; {brief(last)}\n{self.unit.journal(25)}")
 
     def wait_ready(self, timeout_s: float = 40.0) -> Status:
@@ -230,7 +239,7 @@ class Grader:
         while not done(self.api.status()):
             if time.monotonic() > until_s:
                 raise WaitError(f"jog {axis} {value}: not within {timeout_s:g} s; {brief(self.api.status())}")
-            time.sleep(0.05)
+            time.sleep(ASK_EVERY_S)
             try:
                 self.api.command("renew")
             except Refused:
@@ -272,6 +281,26 @@ def brief(status: Status | None) -> str:
         f"soil {soil['zone']} {soil['age_s']} s ({soil['reason']}), unmet {mandatory_unmet(status)}, "
         f"tick {status['tick']}"
     )
+
+
+def armed_and_then(grader: Grader, action: Callable[[], object], fault: str, mode_after: str = "disarmed") -> None:
+    """Arm, let ``action`` happen, see the fault told in time and the machine left as the catalogue says."""
+    grader.arm("manual")
+    began_s = time.monotonic()
+    action()
+    grader.wait(fault, lambda s: fault in faults(s), 3.0)
+    told_s = time.monotonic() - began_s
+    assert told_s <= TOLD_S, f"{fault} told after {told_s:.2f} s"
+    grader.wait(mode_after, lambda s: s["mode"] == mode_after, 3.0)
+
+
+def recovered(grader: Grader, pid: int) -> None:
+    """Everything readable again, by the same process, and it can be armed."""
+    grader.wait("actuators back", lambda s: not any(n.startswith("can.") for n in faults(s)), RECOVERED_S)
+    grader.wait_ready(RECOVERED_S)
+    assert grader.unit.pid == pid
+    grader.arm("manual")
+    grader.disarm()
 
 
 class Rig:

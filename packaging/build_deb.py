@@ -227,6 +227,7 @@ def compile_bytecode(package: Package) -> None:
             compileall.compile_dir(
                 path,
                 quiet=2,
+                workers=0,
                 stripdir=str(package.tree),
                 prependdir="/",
                 invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH,
@@ -324,11 +325,12 @@ def build(version: str, architecture: str, pythons: tuple[str, ...], folder: Pat
         package = Package(version, architecture, pythons, scratch / "tree")
         package.tree.mkdir(mode=0o755)
         os.umask(0o022)
-        with ThreadPoolExecutor(thread_name_prefix="wheel") as pool:
+        with ThreadPoolExecutor(thread_name_prefix="beside the download") as pool:
             own = pool.submit(our_wheel, package, scratch)
+            placed = pool.submit(place_files, package)
             make_environment(package, wheels_for(package, scratch), own.result())
+            placed.result()
         compile_bytecode(package)
-        place_files(package)
         run("chmod", "-R", "u+rwX,go+rX,go-w", package.tree)
         write_control(package)
         result = folder / f"graderd_{version}_{architecture}.deb"

@@ -32,7 +32,7 @@ DROP_IN = Path("/etc/systemd/system/graderd.service.d")
 # 0.2 s longer patience where the whole guest may stand still for that long.
 FOR_THE_GUEST: dict[str, object] = {
     "rotation.poll_hz": 25.0,
-    "rotation.velocity_deg_per_s": 9.0,  # so that a test can look while it turns
+    "rotation.velocity_deg_per_s": 12.0,  # so that a test can look while it turns
     "rotation.watchdog_s": 0.4,
     "rotation.goal_timeout_s": 0.4,
     "rotation.reply_timeout_s": 0.5,
@@ -61,7 +61,6 @@ FOR_THE_GUEST: dict[str, object] = {
 # What the tests of the bus ask for beside the interface: a stop message, and to move where somebody says.
 STOP_PGN = 0xFF77
 ON_THE_BUS: dict[str, object] = {
-    "can.channel": CAN,
     "can.stop_pgn_n": STOP_PGN,
     "can.obey_commanded_address": True,
 }
@@ -117,8 +116,8 @@ def rig(request: pytest.FixtureRequest, wire: str) -> Iterator[Rig]:
 
 
 @pytest.fixture(scope="session")
-def service(request: pytest.FixtureRequest, rig: Rig) -> Iterator[Grader]:
-    """The installed service, running and disarmed."""
+def grader(request: pytest.FixtureRequest) -> Iterator[Grader]:
+    """The installed service, not started yet."""
     CORES.mkdir(exist_ok=True)
     pattern = Path("/proc/sys/kernel/core_pattern")
     former_pattern = pattern.read_text(encoding="ascii")
@@ -131,19 +130,31 @@ def service(request: pytest.FixtureRequest, rig: Rig) -> Iterator[Grader]:
         "Environment=MALLOC_MMAP_THRESHOLD_=1000000000\n",
         encoding="utf-8",
     )
-    grader = Grader()
-    grader.start_with(rig.configuration() | FOR_THE_GUEST | ON_THE_BUS)
+    service = Grader()
+    yield service
+    if _left_turning(request):
+        return
+    service.unit.ctl("stop")
+    assert service.unit.show("Result") == "success", service.unit.journal()
+    pattern.write_text(former_pattern, encoding="ascii")
+    assert not bus_users(CAN), bus_users(CAN)
+    assert not Path("/run/graderd").exists()
+
+
+@pytest.fixture(scope="module")
+def channel() -> str:
+    """The CAN interface a module has the service on; a module with one of its own says so."""
+    return CAN
+
+
+@pytest.fixture(scope="module")
+def service(grader: Grader, rig: Rig, channel: str) -> Iterator[Grader]:
+    """The service, running, with no more sockets at the module's end than at its beginning."""
+    grader.run_with(rig.configuration() | FOR_THE_GUEST | ON_THE_BUS | {"can.channel": channel})
     before = _descriptors(grader)
     yield grader
     after = _descriptors(grader) if grader.unit.pid else {}
     assert after.get("socket", 0) <= before["socket"] + 1, f"sockets leaked: {before} -> {after}"
-    if _left_turning(request):
-        return
-    grader.unit.ctl("stop")
-    assert grader.unit.show("Result") == "success", grader.unit.journal()
-    pattern.write_text(former_pattern, encoding="ascii")
-    assert not bus_users(CAN), bus_users(CAN)
-    assert not Path("/run/graderd").exists()
 
 
 @pytest.fixture(autouse=True)

@@ -7,15 +7,16 @@ import time
 
 import pytest
 
-from hil.bus import RawBus
+from hil.bus import RawBus, daemons_claim
 from hil.service import SOCKET, Grader, Rig, turn, wait_for
 from tests.hil.conftest import bus_users
 
 # Until the servo's own watchdog has ended the motion, at the speed the tests turn with.
 STANDS_WITHIN_S = 2.0
-FURTHER_DEG = 10.0
+FURTHER_DEG = 13.0
 CAN = "vcan0"
 ACM = 0xEF00
+OURS = 0xE7
 
 pytestmark = pytest.mark.timeout(240)
 
@@ -89,8 +90,7 @@ def test_a_killed_daemon_is_replaced_and_the_guard_speaks(ready: Grader, rig: Ri
     assert "guard" in log
 
 
-@pytest.mark.endurance
-def test_stop_and_start_by_hand(ready: Grader, rig: Rig) -> None:
+def test_stop_and_start_by_hand(ready: Grader, rig: Rig, listener: RawBus) -> None:
     turn(ready, rig)
     began_deg, began_s = angle(rig), time.monotonic()
     ready.unit.ctl("stop")
@@ -101,8 +101,10 @@ def test_stop_and_start_by_hand(ready: Grader, rig: Rig) -> None:
     assert stood_deg < 44.0, "it stopped on the way"
     assert not bus_users(CAN), "a socket is left behind"
     assert not SOCKET.parent.exists()
+    listener.drain()
     state = ready.start()
     assert state["mode"] == "disarmed"
+    assert daemons_claim(listener)[0] == OURS, "a start asks for the preferred address, whatever it had before"
     assert angle(rig) == pytest.approx(stood_deg, abs=0.3)
 
 
