@@ -22,7 +22,7 @@ from pathlib import Path
 from hil import uml
 from hil.kernel import VIRTUAL_TIME, virtual_time_kernel
 from hil.shutdown import judge
-from hil.suite import PARTS
+from hil.suite import PARTS, pytest_command
 
 PROJECT = Path(__file__).resolve().parent.parent
 PYTHON = PROJECT / ".venv" / "bin" / "python"
@@ -86,6 +86,11 @@ def unpacked(package: Path) -> Path:
     return place
 
 
+def rewrite_tests() -> None:
+    """Let pytest put its own form of the test modules beside them, so that no guest need make it for itself."""
+    subprocess.run(pytest_command("--collect-only", "-q"), cwd=PROJECT, capture_output=True, check=False)
+
+
 def can_run_here() -> str:
     """Empty where the suite can run on this machine itself, else why not."""
     if os.geteuid() != 0:
@@ -135,7 +140,9 @@ def in_guests(package: Path, wanted: str, soak_s: float, kernel: Kernel) -> list
     """The parts in two guests, side by side where there are two processors; the second's log after the first's."""
     work = Part("work", 900.0, 0)
     endurance = Part("soak" if wanted == "soak" else "endurance", soak_s + 600.0, 1)
-    tree = unpacked(package)
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="rewrite") as pool:
+        pool.submit(rewrite_tests)
+        tree = unpacked(package)
     if wanted in ("soak", "endurance"):
         return [in_guest(endurance, package, tree, kernel, follow=True)]
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="guest") as pool:

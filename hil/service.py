@@ -75,6 +75,12 @@ class Unit:
         """One property."""
         return run("systemctl", "show", "--value", "-p", name, self.name).stdout.strip()
 
+    def numbers(self, *names: str) -> tuple[int, ...]:
+        """Several properties that are numbers, at one moment."""
+        found = run("systemctl", "show", *(f"--property={name}" for name in names), self.name).stdout
+        said = dict(line.split("=", 1) for line in found.splitlines())
+        return tuple(int(said[name]) for name in names)
+
     @property
     def state(self) -> str:
         """ActiveState: active, inactive, failed, activating, deactivating."""

@@ -45,7 +45,8 @@ def stands(rig: Rig, began_deg: float, within_s: float = STANDS_WITHIN_S) -> flo
 
 def back_disarmed(grader: Grader, old_pid: int, timeout_s: float) -> None:
     """A new process, disarmed, that can be armed again."""
-    wait_for("a new process", lambda: grader.unit.pid not in (0, old_pid), timeout_s)
+    # Asking systemd starts a program each time, which takes the processor from the guard and the new process.
+    wait_for("a new process", lambda: grader.unit.pid not in (0, old_pid), timeout_s, 0.5)
     state = grader.wait("it answers", lambda s: s["mode"], timeout_s)
     assert state["mode"] == "disarmed"
     grader.wait_ready()
@@ -71,7 +72,6 @@ def test_a_frozen_daemon_is_replaced_and_the_blade_stands(ready: Grader, rig: Ri
     assert ready.api.status()["mode"] == "disarmed"
 
 
-@pytest.mark.endurance
 @pytest.mark.restarts(1)
 def test_a_killed_daemon_is_replaced_and_the_guard_speaks(ready: Grader, rig: Rig, listener: RawBus) -> None:
     turn(ready, rig)
