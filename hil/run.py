@@ -1,8 +1,8 @@
 """The whole hardware-in-the-loop run: ``make hil``.
 
 Where the running kernel makes a vcan, root runs, systemd is the first process and no graderd is installed, the suite
-runs here. Elsewhere it runs in two user-mode Linux guests of this machine's own files, side by side: crashes and the
-soak in one, the rest with the shutdown in the other. The same tests either way; only the shutdown needs a computer that
+runs here. Elsewhere it runs in two user-mode Linux guests of this machine's own files, side by side: the soak in one,
+nearly all else with the shutdown in the other. The same tests either way; only the shutdown needs a computer that
 may be shut down.
 """
 
@@ -22,7 +22,7 @@ from pathlib import Path
 from hil import uml
 from hil.kernel import VIRTUAL_TIME, virtual_time_kernel
 from hil.shutdown import judge
-from hil.suite import PARTS, pytest_command
+from hil.suite import PARTS
 
 PROJECT = Path(__file__).resolve().parent.parent
 PYTHON = PROJECT / ".venv" / "bin" / "python"
@@ -86,11 +86,6 @@ def unpacked(package: Path) -> Path:
     return place
 
 
-def rewrite_tests() -> None:
-    """Let pytest put its own form of the test modules beside them, so that no guest need make it for itself."""
-    subprocess.run(pytest_command("--collect-only", "-q"), cwd=PROJECT, capture_output=True, check=False)
-
-
 def can_run_here() -> str:
     """Empty where the suite can run on this machine itself, else why not."""
     if os.geteuid() != 0:
@@ -140,9 +135,7 @@ def in_guests(package: Path, wanted: str, soak_s: float, kernel: Kernel) -> list
     """The parts in two guests, side by side where there are two processors; the second's log after the first's."""
     work = Part("work", 900.0, 0)
     endurance = Part("soak" if wanted == "soak" else "endurance", soak_s + 600.0, 1)
-    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="rewrite") as pool:
-        pool.submit(rewrite_tests)
-        tree = unpacked(package)
+    tree = unpacked(package)
     if wanted in ("soak", "endurance"):
         return [in_guest(endurance, package, tree, kernel, follow=True)]
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="guest") as pool:
@@ -173,7 +166,7 @@ def keep_failed(number: int) -> None:
 def main() -> int:
     """Command line; 0 where every run passed."""
     parser = argparse.ArgumentParser(prog="make hil", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--part", choices=PARTS, default="all", help="endurance: crashes and the soak; work: the rest")
+    parser.add_argument("--part", choices=PARTS, default="all", help="endurance: a freeze and the soak; work: the rest")
     parser.add_argument("--soak-s", type=float, default=120.0, help="length of the soak in seconds")
     parser.add_argument("--guest", action="store_true", help="in a guest even where it could run here")
     parser.add_argument(

@@ -73,15 +73,11 @@ def mount_unpacked(opt: Path) -> None:
     subprocess.run(["mount", "-t", "overlay", "-o", options, "overlay", "/opt"], check=True)
 
 
-def pytest_command(*arguments: str) -> list[str]:
-    """What runs pytest on this suite with this project's environment."""
-    return [str(PROJECT / ".venv/bin/python"), "-m", "pytest", *OPTIONS, *arguments, str(TESTS)]
-
-
 def pytest(part: str) -> int:
-    """Run the tests of one part."""
+    """Run the tests of one part with this project's environment."""
     chosen = os.environ.get("PYTEST_ARGS", "").split()
-    status = subprocess.run(pytest_command("-m", PARTS[part], *chosen), cwd=PROJECT, check=False).returncode
+    command = [str(PROJECT / ".venv/bin/python"), "-m", "pytest", *OPTIONS, "-m", PARTS[part], str(TESTS), *chosen]
+    status = subprocess.run(command, cwd=PROJECT, check=False).returncode
     # Tests somebody asked for by name may all be in the other part.
     return 0 if chosen and status == NOTHING_SELECTED else status
 

@@ -72,7 +72,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """The suite's own marks."""
     config.addinivalue_line("markers", "error_frames: the test makes the bus report errors")
     config.addinivalue_line("markers", "restarts(n): systemd restarts the service so often during the test")
-    config.addinivalue_line("markers", "endurance: ends and comes back, or runs long; in the second guest")
+    config.addinivalue_line("markers", "endurance: in the second guest, so that both take about as long as each other")
     config.addinivalue_line("markers", "soak: the long run with faults")
     config.addinivalue_line("markers", "shutdown: leaves the machine as it is, for the shutdown that follows")
 
