@@ -155,6 +155,10 @@ def main() -> int:
         wait_for(str(SERVO), SERVO.exists, 30.0)
         found |= {"port": SERVO.resolve().name, "latency_ms": wait_for("latency timer", latency_ms, 5.0)}
         assert found["latency_ms"] == 1, found
+    with report.step("an adapter that was there first gets its name when the package is configured"):
+        SERVO.unlink()
+        run("/var/lib/dpkg/info/graderd.postinst", "configure", timeout_s=PATIENCE_S)
+        wait_for(str(SERVO), SERVO.exists, 30.0)
     with report.step("graderd-can@ sets the far controller up") as found:
         run("systemctl", "start", f"graderd-can@{THEIRS}.service", timeout_s=PATIENCE_S)
         found |= link(THEIRS)
