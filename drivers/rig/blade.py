@@ -106,8 +106,11 @@ class Plough:
         self.restless = True
         """Whether soil near the blade is still sliding."""
 
-    def move(self, x_m: float, pose: BladePose, new_x_m: float, new_pose: BladePose, duration_s: float) -> None:
-        """Take the blade from one place (bed x of its axis, pose) to another within ``duration_s``."""
+    def move(self, x_m: float, pose: BladePose, new_x_m: float, new_pose: BladePose, duration_s: float) -> bool:
+        """Take the blade from one place (bed x of its axis, pose) to another within ``duration_s``.
+
+        Returns whether anything moved, blade or soil.
+        """
         turn_rad = math.radians(new_pose.angle_deg - pose.angle_deg)
         travel_m = new_x_m - x_m
         reach_m = abs(travel_m) + abs(turn_rad) * LENGTH_M / 2.0
@@ -116,15 +119,16 @@ class Plough:
         )
         moving = shift_m > 1e-6
         if not (moving or self.restless):
-            return
+            return False
         if not self._field.heights_m[self._window(new_x_m, new_pose).slices].any():
             self.restless = False
-            return
+            return True
         count = min(max(1, math.ceil(reach_m / (0.5 * self._field.cell_m))), _MOST_STEPS_N)
         speed_m_per_s, turn_rad_per_s = travel_m / duration_s, turn_rad / duration_s
         for number in range(1, count + 1):
             share = number / count
             self._step(x_m + share * travel_m, pose.between(new_pose, share), speed_m_per_s, turn_rad_per_s, moving)
+        return True
 
     def settle(self, x_m: float, pose: BladePose) -> None:
         """Let the soil round a blade that stands still come to rest."""
