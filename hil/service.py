@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
-import signal
 import socket
 import subprocess
 import time
@@ -96,10 +94,6 @@ class Unit:
         """How often systemd has started it again by itself since boot (NRestarts begins anew with a start by hand)."""
         found = run("journalctl", "--boot", "-q", "-o", "cat", f"UNIT={self.name}", f"MESSAGE_ID={RESTART_SCHEDULED}")
         return len(found.stdout.splitlines())
-
-    def kill(self, number: signal.Signals) -> None:
-        """Send a signal to the main process."""
-        os.kill(self.pid, number)
 
     def journal(self, lines: int = 60) -> str:
         """The newest lines of its log."""
