@@ -45,6 +45,7 @@ SETTINGS: Final[dict[str, object]] = {
     "camera.path": "/run/hil-project/docs/pictures",
     "camera.repeat": True,
     "camera.rate_hz": 0.05,
+    "rule.vote_max_age_s": 60.0,
     "camera.stale_s": 600.0,
     "camera.restart_s": 600.0,
     "can.channel": OURS,

@@ -152,4 +152,11 @@ class Config(Settings):
         ):
             if not self.gate.rotation_min_deg <= angle_deg <= self.gate.rotation_max_deg:
                 raise ValueError(f"rule.{zone} ({angle_deg:g}) lies outside gate.rotation_min_deg..rotation_max_deg")
+        needed_n, age_s, rate_hz = self.rule.votes_needed_n, self.rule.vote_max_age_s, self.camera.rate_hz
+        if rate_hz * age_s < needed_n - 1:
+            raise ValueError(
+                f"at camera.rate_hz ({rate_hz:g}) the rule.votes_needed_n ({needed_n}) pictures that must agree never "
+                f"all lie within rule.vote_max_age_s ({age_s:g}): automatic operation could not decide anything. Raise "
+                f"the one or the other until their product is {needed_n - 1} or more"
+            )
         return self

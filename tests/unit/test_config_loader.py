@@ -44,6 +44,7 @@ def test_all_mistakes_at_once(tmp_path: Path) -> None:
     [
         ("[rotation]\nmin_deg = 10\nmax_deg = -10\n", "min_deg (10.0) must be below max_deg (-10.0)"),
         ("[rule]\nleft_deg = 80\n", "rule.left_deg (80) lies outside gate"),
+        ("[camera]\nrate_hz = 1.9\n", "until their product is 3 or more"),
         ("[lift_left]\naddress_n = 20\n", "four different addresses"),
         ("[rule]\nleft_deg = nan\n", "finite"),
         ("[control]\nshutdown_order = ['rotation']\n", "shutdown_order"),
