@@ -109,6 +109,7 @@ def test_stop_and_start_by_hand(ready: Grader, rig: Rig, listener: RawBus) -> No
     assert angle(rig) == pytest.approx(stood_deg, abs=0.3)
 
 
+@pytest.mark.endurance
 def test_the_clock_may_jump(ready: Grader, rig: Rig) -> None:
     """An hour forward and back, by a GPS receiver or a person: control does not notice."""
     turn(ready, rig)
