@@ -166,7 +166,7 @@ def keep_failed(number: int) -> None:
 def main() -> int:
     """Command line; 0 where every run passed."""
     parser = argparse.ArgumentParser(prog="make hil", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--part", choices=PARTS, default="all", help="endurance: freeze, clock and soak; work: the rest")
+    parser.add_argument("--part", choices=PARTS, default="all", help="endurance: freeze, clock, soak; work: the rest")
     parser.add_argument("--soak-s", type=float, default=120.0, help="length of the soak in seconds")
     parser.add_argument("--guest", action="store_true", help="in a guest even where it could run here")
     parser.add_argument(
