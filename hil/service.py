@@ -283,15 +283,15 @@ def brief(status: Status | None) -> str:
     )
 
 
-def armed_and_then(grader: Grader, action: Callable[[], object], fault: str, mode_after: str = "disarmed") -> None:
-    """Arm, let ``action`` happen, see the fault told in time and the machine left as the catalogue says."""
+def armed_and_then(grader: Grader, action: Callable[[], object], fault: str) -> None:
+    """Arm, let ``action`` happen, see the fault told in time and the machine disarmed."""
     grader.arm("manual")
     began_s = time.monotonic()
     action()
     grader.wait(fault, lambda s: fault in faults(s), 3.0)
     told_s = time.monotonic() - began_s
     assert told_s <= TOLD_S, f"{fault} told after {told_s:.2f} s"
-    grader.wait(mode_after, lambda s: s["mode"] == mode_after, 3.0)
+    grader.wait("disarmed", lambda s: s["mode"] == "disarmed", 3.0)
 
 
 def recovered(grader: Grader, pid: int) -> None:

@@ -84,7 +84,6 @@ class World:
         self.blade = BladePose()
         self.load = BladeLoad()
         self.plough = Plough(self.field)
-        self._moved = True
 
     def step(self, step_s: float, pose: BladePose) -> None:
         """Let ``step_s`` pass, in which the actuators took the blade to ``pose``."""
@@ -93,10 +92,9 @@ class World:
         moved = self.plough.move(before_m, self.blade, self.vehicle.x_m, pose, step_s)
         turn_rad_per_s = math.radians(pose.angle_deg - self.blade.angle_deg) / step_s
         self.blade = pose
-        # Where nothing moved in this step nor in the one before, the load is what it was.
-        if moved or self._moved:
+        # Where nothing moved the load is what it was; the first step at rest still counts as one in which soil slides.
+        if moved:
             self.load = blade_load(self.field, self.vehicle.x_m, pose, self.vehicle.speed_m_per_s, turn_rad_per_s)
-        self._moved = moved
 
     def lay(self, heights_m: FloatArray) -> None:
         """Replace the soil by ``heights_m`` (the field's shape); it settles round the blade in the next steps."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.rig.blade import BladePose
+from drivers.rig.load import blade_load
 from drivers.rig.look import Look
 from drivers.rig.piles import SceneZone
 from drivers.rig.shared import SharedScene
@@ -135,3 +138,21 @@ def test_rig_shared_memory_never_shows_half_a_state() -> None:
         thread.join()
     writer.close()
     writer.close()
+
+
+def test_rig_load_at_rest_is_what_it_would_be_worked_out_anew() -> None:
+    world, pose, kept_n = World(), BladePose(), 0
+    world.lay(scene_heights(SceneZone.LEFT, world.vehicle.x_m, pose, seed=3))
+    for number in range(1500):
+        if 200 <= number < 400:
+            pose = replace(pose, angle_deg=pose.angle_deg + 0.12)
+        elif 600 <= number < 700:
+            pose = replace(pose, height_m=pose.height_m + 1e-4)
+        elif number == 900:
+            world.vehicle.drive(0.5, 0.5)
+        load, angle_deg = world.load, world.blade.angle_deg
+        world.step(0.01, pose)
+        kept_n += world.load is load
+        turn = math.radians(pose.angle_deg - angle_deg) / 0.01
+        assert world.load == blade_load(world.field, world.vehicle.x_m, pose, world.vehicle.speed_m_per_s, turn)
+    assert kept_n > 500, "worked out only while something moves"
