@@ -53,7 +53,7 @@ def wire_limit_hz(baud_n: int) -> float:
 
 
 async def _ours(port: str, baud_n: int) -> tuple[Callable[[], Awaitable[bool]], Callable[[], None]]:
-    from drivers.dynamixel.bus import ServoBus
+    from graderd.drivers.dynamixel.bus import ServoBus
     from graderd.hal.errors import DeviceTimeoutError
 
     bus = ServoBus(port, baud_n)
@@ -197,7 +197,7 @@ def run(seconds: float, rounds_n: int) -> dict[str, Any]:
 @contextlib.contextmanager
 def _servo(link: Path, baud_n: int) -> Iterator[str]:
     """A virtual servo on a wire that takes its time, in a process of its own; the port's path."""
-    command = [sys.executable, "-m", "drivers.dynamixel.virtual", "--link", str(link)]
+    command = [sys.executable, "-m", "graderd.simulator.servo", "--link", str(link)]
     command += ["--baud", str(baud_n), "--wire-time"]
     servo = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
     try:

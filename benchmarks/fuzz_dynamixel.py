@@ -19,7 +19,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 
-from drivers.dynamixel.codec import (
+from graderd.drivers.dynamixel.codec import (
     FastReply,
     Instruction,
     Packet,
@@ -29,8 +29,8 @@ from drivers.dynamixel.codec import (
     encode_status,
     split_fast_status,
 )
-from drivers.dynamixel.virtual import VirtualServo
-from drivers.dynamixel.virtual.line import answers
+from graderd.simulator.servo import VirtualServo
+from graderd.simulator.servo.line import answers
 
 FAST_LAYOUT = [(1, 4), (3, 4)]
 SURE = ("burst", "bits", "cut")

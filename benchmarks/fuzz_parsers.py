@@ -22,21 +22,21 @@ import numpy as np
 import tomlkit
 from pydantic import TypeAdapter, ValidationError
 
-from drivers.dynamixel.table import ControlTable
-from drivers.electrak.profile import load_profile
-from drivers.rig.commands import COMMAND as RIG_COMMAND
-from firmware_profiles import UnknownProfileError
 from graderd.config import Config, ConfigError, load
 from graderd.config.migrate import migrate_text, rename
 from graderd.core.blade import BladeGeometry
 from graderd.core.commands import AnyCommand, Command
-from graderd.core.zones import SoilObservation, Zone
+from graderd.core.soil import SoilObservation, Zone
+from graderd.drivers.dynamixel.table import ControlTable
+from graderd.drivers.electrak.profile import load_profile
+from graderd.firmware_profiles import UnknownProfileError
 from graderd.hal.camera import Frame
 from graderd.hal.errors import DeviceError
 from graderd.perception.frame_set import Entry, FrameSet, FrameSetWriter
 from graderd.perception.settings import CameraCalibration
+from graderd.runtime.perception_protocol import FromChild, Observed
 from graderd.runtime.state_file import StateFile
-from graderd.runtime.worker_protocol import FromChild, Observed
+from graderd.simulator.control_server import COMMAND as RIG_COMMAND
 
 ABSURD = (b"1e999", b"-1", b"nan", b"9" * 400, b"null", b"[]", b"{}", b"true", b"''", b"0x10", b"1979-05-27", b"\xff")
 MOST_BYTES = 64 << 20
@@ -103,7 +103,7 @@ def targets(directory: Path) -> dict[str, Target]:
             (
                 seen.model_dump_json().encode(),
                 b'{"kind": "opened", "description": "x", "settings_read_back": {"gain": 1.0}, "not_kept": []}',
-                b'{"kind": "trouble", "condition": "stale", "message": "x"}',
+                b'{"kind": "problem", "condition": "stale", "message": "x"}',
             ),
             _child,
             (ValueError,),

@@ -25,14 +25,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from drivers.electrak.codec import Control, ElectrakCodec, load_database
-from drivers.electrak.j1939.ids import Frame
-from drivers.electrak.link import CanLink
-from drivers.electrak.ports import BusPort, SlcanPort
-from drivers.electrak.slcan_bus import QuietSlcanBus
-from drivers.electrak.virtual.slcan import SlcanAdapter
-from drivers.electrak.virtual.wire import Wire
+from graderd.drivers.electrak.codec import Control, ElectrakCodec, load_database
+from graderd.drivers.j1939.can_port import BusPort, SlcanPort
+from graderd.drivers.j1939.ids import Frame
+from graderd.drivers.j1939.link import CanLink
+from graderd.drivers.j1939.slcan_bus import QuietSlcanBus
 from graderd.hal.settings import CanSettings
+from graderd.simulator.actuators.slcan import SlcanAdapter
+from graderd.simulator.actuators.wire import Wire
 
 # Run as a script, this file's folder leads the search path and this file is called as the peer is.
 sys.path[:] = [entry for entry in sys.path if not entry.endswith("benchmarks")]

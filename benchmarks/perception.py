@@ -22,11 +22,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drivers.rig.dataset import export
 from graderd.perception import METHODS, Method, PerceptionSettings
 from graderd.perception.classifier import make_classifier
 from graderd.perception.frame_set import FrameSet
 from graderd.perception.scoring import Score
+from graderd.simulator.dataset import export
 
 HOLD_OUT_SEED = 9001
 """Not one of the seeds that thresholds were chosen on (101, 202)."""

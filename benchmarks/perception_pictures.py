@@ -7,13 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drivers.rig.blade import BladePose
-from drivers.rig.ground import SceneState
-from drivers.rig.look import Look
-from drivers.rig.piles import SceneZone
-from drivers.rig.renderer import Renderer
-from drivers.rig.soil import SoilField
-from drivers.rig.world import scene_heights
 from graderd.core.blade import BladeGeometry
 from graderd.hal.camera import Frame
 from graderd.perception import CameraCalibration, PerceptionSettings
@@ -21,13 +14,20 @@ from graderd.perception.annotate import text_on
 from graderd.perception.classifier import SoilClassifier
 from graderd.perception.color import paper_steps
 from graderd.perception.geometry import U8
+from graderd.simulator.camera.appearance import Appearance
+from graderd.simulator.camera.ground import SceneState
+from graderd.simulator.camera.renderer import Renderer
+from graderd.simulator.grader.blade import BladePose
+from graderd.simulator.grader.piles import SceneZone
+from graderd.simulator.grader.soil import SoilField
+from graderd.simulator.grader.world import scene_heights
 
 OUT = Path("docs/pictures")
 ANGLE_DEG = 20.0
 SIZE = (480, 300)
 
 
-def photograph(look: Look) -> Frame:
+def photograph(look: Appearance) -> Frame:
     """A left heap before a turned blade."""
     renderer = Renderer((1280, 800), (848, 480), seed=7)
     pose = BladePose(ANGLE_DEG)
@@ -54,7 +54,7 @@ def save(name: str, pictures: list[U8]) -> None:
 def main() -> None:
     """Write all pictures."""
     blade, calibration = BladeGeometry(), CameraCalibration()
-    brown = photograph(Look(soil="loam", ground="concrete", blade="steel"))
+    brown = photograph(Appearance(soil="loam", ground="concrete", blade="steel"))
     paper = SoilClassifier(PerceptionSettings(method="paper"), calibration, blade, live=False)
     filtered, mask, contour = paper_steps(brown.color_bgr, PerceptionSettings().color)
     said = paper.classify(brown, ANGLE_DEG, 0.0)
@@ -67,7 +67,7 @@ def main() -> None:
             titled(paper.annotate(brown, said), "area per third"),
         ],
     )
-    hard = photograph(Look(soil="gravel", ground="plywood", blade="rusty", red_cast=0.25))
+    hard = photograph(Appearance(soil="gravel", ground="plywood", blade="rusty", red_cast=0.25))
     fused = SoilClassifier(PerceptionSettings(), calibration, blade, live=False)
     soil = fused.height_map(hard, ANGLE_DEG)
     assert soil is not None

@@ -24,14 +24,14 @@ import numpy as np
 import psutil
 
 from graderd.core.blade import BladeGeometry
-from graderd.core.zones import Zone
+from graderd.core.soil import Zone
 from graderd.hal.camera import Camera, EndOfFrames, Frame
 from graderd.hal.clock import SystemClock
 from graderd.hal.settings import CameraSettings
 from graderd.perception import CameraCalibration, PerceptionSettings
-from graderd.runtime.app import worker as worker_process
+from graderd.runtime.app import perception_child as worker_process
 from graderd.runtime.app.frame_sources import open_camera
-from graderd.runtime.perception import PerceptionWorker
+from graderd.runtime.perception_supervisor import PerceptionSupervisor
 from tests.perception_scenes import Scene, render
 from tests.realsense_devices import Color, Depth, SoftD455, record
 
@@ -118,7 +118,7 @@ async def soak(path: Path, count: int) -> bool:
     settings = settings_for(path)
     command = (sys.executable, "-m", __spec__.name, "--worker", "--frames", str(count))
     clock = SystemClock()
-    worker = PerceptionWorker(
+    worker = PerceptionSupervisor(
         settings, CameraCalibration(), PerceptionSettings(), BladeGeometry(), clock, command=command
     )
     me = psutil.Process()

@@ -17,14 +17,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from drivers.rig.blade import BladePose
-from drivers.rig.dataset import export
-from drivers.rig.ground import SceneState
-from drivers.rig.look import Look
-from drivers.rig.materials import Materials
-from drivers.rig.piles import SceneZone
-from drivers.rig.renderer import Renderer
-from drivers.rig.world import World, scene_heights
+from graderd.simulator.camera.appearance import Appearance
+from graderd.simulator.camera.ground import SceneState
+from graderd.simulator.camera.materials import Materials
+from graderd.simulator.camera.renderer import Renderer
+from graderd.simulator.dataset import export
+from graderd.simulator.grader.blade import BladePose
+from graderd.simulator.grader.piles import SceneZone
+from graderd.simulator.grader.world import World, scene_heights
 
 BAR_FPS = 15.0
 SIZES = (
@@ -59,7 +59,7 @@ def pictures() -> list[dict[str, Any]]:
             angle_deg = (angle_deg + 1.0) % 45.0
             soil = world.field.heights_m.astype(np.float32)
             blade = BladePose(angle_deg)
-            renderer.render(SceneState(soil, world.field.cell_m, world.vehicle.x_m, blade), Look())
+            renderer.render(SceneState(soil, world.field.cell_m, world.vehicle.x_m, blade), Appearance())
 
         frame()
         cpu_s, wall_s = timed(frame, 40)

@@ -331,7 +331,7 @@ class Rig:
             "--setenv=MALLOC_MMAP_THRESHOLD_=1000000000",
             # At shutdown the hardware is still there when the service ends.
             "--property=Before=graderd.service",
-            *(PYTHON, "-I", "-m", "drivers.rig", f"--dir={RIG_DIRECTORY}", f"--can=socketcan:{self._can}"),
+            *(PYTHON, "-I", "-m", "graderd.simulator", f"--dir={RIG_DIRECTORY}", f"--can=socketcan:{self._can}"),
             f"--seed={self._seed}",
         )
         wait_for("rig.json", (RIG_DIRECTORY / "rig.json").exists, 40.0)

@@ -31,7 +31,7 @@ ADAPTER: Final = {"driver": "usb-serial", "id": "servo", "bus": "xhci.0", "chard
 @contextlib.contextmanager
 def virtual_servo(link: Path) -> Iterator[None]:
     """A servo behind a pseudo-terminal of this host."""
-    command = [str(PYTHON), "-m", "drivers.dynamixel.virtual", "--link", str(link)]
+    command = [str(PYTHON), "-m", "graderd.simulator.servo", "--link", str(link)]
     with (OUT / "servo").open("wb") as log:
         process = subprocess.Popen(command, cwd=PROJECT, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
     try:

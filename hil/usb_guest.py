@@ -163,7 +163,7 @@ def main() -> int:
     with report.step("graderd-can@ sets the far controller up") as found:
         run("systemctl", "start", f"graderd-can@{THEIRS}.service", timeout_s=PATIENCE_S)
         found |= link(THEIRS)
-    actuators = ("-I", "-m", "drivers.electrak.virtual", f"--can={THEIRS}")
+    actuators = ("-I", "-m", "graderd.simulator.actuators", f"--can={THEIRS}")
     run("systemd-run", "--quiet", "--unit=hil-actuators.service", PYTHON, *actuators, timeout_s=PATIENCE_S)
     with report.step("the service starts, sets its own controller up and finds all four axes") as found:
         grader.configure(SETTINGS)

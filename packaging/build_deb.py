@@ -112,9 +112,10 @@ def our_wheel(package: Package, scratch: Path) -> Path:
         check=True,
     ).stdout
     for name in listed.decode().split("\0"):
-        if name and (PROJECT / name).is_file():
+        # The links graderd/drivers and so on are copied as links: they lead into the copy.
+        if name and ((PROJECT / name).is_file() or (PROJECT / name).is_symlink()):
             (source / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(PROJECT / name, source / name)
+            shutil.copy(PROJECT / name, source / name, follow_symlinks=False)
     project = source / "pyproject.toml"
     text = project.read_text(encoding="utf-8")
     own = tomllib.loads(text)["project"]["version"]

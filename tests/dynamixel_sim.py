@@ -15,11 +15,11 @@ from typing import Any
 
 import pytest
 
-from drivers.dynamixel import Ph54Rotator
-from drivers.dynamixel.virtual import VirtualServo, VirtualServoBus
+from graderd.drivers.dynamixel import Ph54Rotator
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import RotatorSettings
-from tests.patience import PatientClock
+from graderd.simulator.servo import VirtualServo, VirtualServoBus
+from tests.awake_clock import AwakeClock
 
 PATIENCE_S = 15.0
 """Deadline of waits in tests: long, because the machine may be busy; nothing is measured by it."""
@@ -32,7 +32,7 @@ class Bench:
     rotator: Ph54Rotator
     servo: VirtualServo
     bus: VirtualServoBus
-    clock: PatientClock
+    clock: AwakeClock
 
     def conditions(self) -> set[str]:
         return {f.condition for f in self.rotator.faults()}
@@ -108,7 +108,7 @@ async def bench(
 ) -> AsyncIterator[Bench]:
     """A virtual servo at ``folder/servo`` and a rotator on it, opened unless told otherwise; all closed at the end."""
     servo = servo or VirtualServo()
-    clock = PatientClock()
+    clock = AwakeClock()
     bus = VirtualServoBus([servo], folder / "servo", clock=clock, **(wire or {}))
     brisk = {"velocity_deg_per_s": 60.0, "acceleration_deg_per_s2": 240.0}  # so that tests need not wait for the blade
     settings = RotatorSettings(**{"port": str(folder / "servo"), **brisk, **changes})
@@ -124,11 +124,11 @@ async def bench(
 
 
 class ServoProcess:
-    """``python -m drivers.dynamixel.virtual`` in a process of its own; commands by its standard input."""
+    """``python -m graderd.simulator.servo`` in a process of its own; commands by its standard input."""
 
     def __init__(self, link: Path, *arguments: str) -> None:
         self.link = link
-        command = [sys.executable, "-m", "drivers.dynamixel.virtual", "--link", str(link), *arguments]
+        command = [sys.executable, "-m", "graderd.simulator.servo", "--link", str(link), *arguments]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self.hello = self._line()
 

@@ -7,11 +7,11 @@ import selectors
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
-from drivers.electrak import CanLink, ElectrakActuator
-from drivers.electrak.ports import BusPort
-from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
+from graderd.drivers.electrak import CanLink, ElectrakActuator
+from graderd.drivers.j1939.can_port import BusPort
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import ActuatorSettings, CanSettings
+from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 
 T = TypeVar("T")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from graderd.core.zones import SoilObservation
+from graderd.core.soil import SoilObservation
 from graderd.hal.clock import ManualClock
 from graderd.hal.errors import CommandRangeError, DeviceError, LifecycleError
 from graderd.hal.fault import DeviceFault

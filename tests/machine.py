@@ -12,8 +12,8 @@ from typing import Any
 
 import httpx
 
-from drivers.rig.control import RigControl
 from graderd.core.status import Status
+from graderd.simulator.control_client import RigControl
 
 READY_S = 60.0
 
@@ -56,7 +56,7 @@ class Machine:
 async def start_rig(directory: Path) -> asyncio.subprocess.Process:
     """A rig in ``directory``, ready."""
     (directory / "rig.json").unlink(missing_ok=True)
-    rig = await asyncio.create_subprocess_exec(sys.executable, "-m", "drivers.rig", "--dir", str(directory))
+    rig = await asyncio.create_subprocess_exec(sys.executable, "-m", "graderd.simulator", "--dir", str(directory))
     async with asyncio.timeout(READY_S):
         while not (directory / "rig.json").exists():
             assert rig.returncode is None

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graderd.core.blade import BladeGeometry, blade_coordinates
-from graderd.core.zones import Zone
+from graderd.core.soil import Zone
 from graderd.hal.camera import Frame
 from graderd.perception.geometry import View, face_setback_m
 from graderd.perception.settings import CameraCalibration, StreamCalibration

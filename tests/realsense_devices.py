@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from drivers.realsense import sdk
+from graderd.drivers.realsense import sdk
 
 Color = npt.NDArray[np.uint8]
 Depth = npt.NDArray[np.uint16]

@@ -30,7 +30,7 @@ def wait_for_ready(directory: Path, process: subprocess.Popen[bytes]) -> dict[st
 @contextlib.contextmanager
 def running_rig(directory: Path, *arguments: str) -> Iterator[tuple[subprocess.Popen[bytes], dict[str, Any]]]:
     """A rig that lives in ``directory`` while the block runs: its process and its ``rig.json``."""
-    process = subprocess.Popen([sys.executable, "-m", "drivers.rig", "--dir", str(directory), *arguments])
+    process = subprocess.Popen([sys.executable, "-m", "graderd.simulator", "--dir", str(directory), *arguments])
     try:
         yield process, wait_for_ready(directory, process)
     finally:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from drivers.dynamixel.codec import (
+from graderd.drivers.dynamixel.codec import (
     Instruction,
     Packet,
     StreamDecoder,
     encode,
 )
-from drivers.dynamixel.virtual import VirtualServo
-from drivers.dynamixel.virtual.line import answers
+from graderd.simulator.servo import VirtualServo
+from graderd.simulator.servo.line import answers
 
 
 class Line:

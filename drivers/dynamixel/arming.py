@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import math
 
-from drivers.dynamixel.calibration import Calibration
-from drivers.dynamixel.device import WATCHDOG_STEP_S, WATCHDOG_TRIPPED, Ph54Device
+from graderd.drivers.dynamixel.calibration import Calibration
+from graderd.drivers.dynamixel.device import WATCHDOG_STEP_S, WATCHDOG_TRIPPED, Ph54Device
 from graderd.hal.errors import DeviceError, DeviceRefusedError
 from graderd.hal.settings import RotatorSettings
 

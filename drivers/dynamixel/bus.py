@@ -12,16 +12,79 @@ import asyncio
 import functools
 import logging
 import os
+from collections import deque
 from collections.abc import Callable
 from typing import Final, Literal
 
 import serial
 
-from drivers.dynamixel import ports
-from drivers.dynamixel.codec import BROADCAST_ID, Instruction, Packet, StatusError, StreamDecoder, encode
-from drivers.dynamixel.turns import Allowance, Turns
+from graderd.drivers.dynamixel import serial_port
+from graderd.drivers.dynamixel.codec import BROADCAST_ID, Instruction, Packet, StatusError, StreamDecoder, encode
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import DeviceError, DeviceLostError, DeviceRefusedError, DeviceTimeoutError
+
+_ALLOWANCE_MIN_S: Final = 0.020
+_ALLOWANCE_START_S: Final = 0.060
+_ALLOWANCE_MAX_S: Final = 0.100
+"""Bounds of what a reply may take beyond wire time: scheduling at the low end, a bad USB adapter at the high one."""
+
+
+class WireAccess:
+    """One at a time; the others wait in order, urgent ones ahead of them. ``taken``: whether it is somebody's turn."""
+
+    def __init__(self) -> None:
+        self.taken = False
+        self._queue: deque[asyncio.Future[None]] = deque()
+
+    async def take(self, urgent: bool) -> None:
+        """Wait for the turn; every turn taken is given back with :meth:`give_back`."""
+        if not self.taken:
+            self.taken = True
+            return
+        turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        if urgent:
+            self._queue.appendleft(turn)
+        else:
+            self._queue.append(turn)
+        try:
+            await turn
+        except asyncio.CancelledError:
+            if turn.done() and not turn.cancelled():
+                self.give_back()
+            raise
+
+    def give_back(self) -> None:
+        """End a turn; the next one's begins at once."""
+        while self._queue:
+            turn = self._queue.popleft()
+            if not turn.done():
+                turn.set_result(None)  # the line stays taken: it goes over to the next one
+                return
+        self.taken = False
+
+
+class Allowance:
+    """What a reply may take beyond its time on the wire, learned from what replies took (RFC 6298).
+
+    ``now_s`` is the present allowance: smoothed mean plus four times the smoothed spread, within bounds.
+    """
+
+    def __init__(self) -> None:
+        self.now_s = _ALLOWANCE_START_S
+        self._smooth_s = 0.0
+        self._spread_s = 0.0
+
+    def learn(self, extra_s: float) -> None:
+        """A reply took so much longer than the wire needs."""
+        self._spread_s += 0.25 * (abs(extra_s - self._smooth_s) - self._spread_s)
+        self._smooth_s += 0.125 * (extra_s - self._smooth_s)
+        wanted_s = self._smooth_s + 4 * self._spread_s + 0.25 * _ALLOWANCE_MIN_S
+        self.now_s = min(_ALLOWANCE_MAX_S, max(_ALLOWANCE_MIN_S, wanted_s))
+
+    def widen(self) -> None:
+        """No reply came in time."""
+        self.now_s = min(_ALLOWANCE_MAX_S, self.now_s * 1.5)
+
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +103,8 @@ def _read_packet(servo_id: int, address: int, size: int) -> bytes:
 
 
 class ServoRefusedError(DeviceRefusedError):
-    """The servo answered with an error number; ``error`` is its :class:`~drivers.dynamixel.codec.StatusError` value."""
+    """The servo answered with an error number; ``error`` is its
+    :class:`~graderd.drivers.dynamixel.codec.StatusError` value."""
 
     def __init__(self, where: str, request: str, error: int) -> None:
         known = error in StatusError.__members__.values()
@@ -84,7 +148,7 @@ class ServoBus:
         self._serial: serial.Serial | None = None
         self._fd = -1
         self._decoder = StreamDecoder()
-        self._turns = Turns()
+        self._access = WireAccess()
         self._allowance = Allowance()
         self._reply: asyncio.Future[Packet | None] | None = None
         self._wanted_id = 0
@@ -107,9 +171,9 @@ class ServoBus:
             DeviceMissingError: no such port, or it may not be opened.
             DeviceRefusedError: the adapter cannot do the baud rate.
         """
-        self._serial = ports.open_port(self.port, self.baud_n)
-        self.low_latency = ports.set_low_latency(self._serial)
-        self.latency_timer_ms = ports.latency_timer_ms(self.port)
+        self._serial = serial_port.open_port(self.port, self.baud_n)
+        self.low_latency = serial_port.set_low_latency(self._serial)
+        self.latency_timer_ms = serial_port.latency_timer_ms(self.port)
         if (self.latency_timer_ms or 0) > 2:
             log.warning(
                 "%s: the adapter holds replies back for %d ms (low_latency not available): at most %d requests "
@@ -197,13 +261,13 @@ class ServoBus:
 
     async def send(self, servo_id: int, instruction: int, params: bytes = b"") -> None:
         """Send an instruction that nobody answers (broadcasts; a servo whose status return level is unknown)."""
-        await self._turns.take(False)
+        await self._access.take(False)
         try:
             self._transmit(encode(servo_id, instruction, params))
             await asyncio.sleep(self._byte_s * (12 + len(params)) + self._return_delay_s)
             self._suspect = servo_id != BROADCAST_ID  # should it answer after all, that is not the next one's reply
         finally:
-            self._turns.give_back()
+            self._access.give_back()
 
     async def request(
         self,
@@ -230,12 +294,12 @@ class ServoBus:
     async def _ask(
         self, servo_id: int, packet: bytes, reply_data_n: int | None, attempts_n: int, urgent: bool
     ) -> Packet:
-        turns = self._turns
+        access = self._access
         for attempt in range(attempts_n):
-            if turns.taken:
-                await turns.take(urgent)
+            if access.taken:
+                await access.take(urgent)
             else:
-                turns.taken = True
+                access.taken = True
             try:
                 if attempt:
                     self._counters["retries_n"] += 1
@@ -243,7 +307,7 @@ class ServoBus:
                     continue
                 reply = await self._exchange(packet, servo_id, reply_data_n)
             finally:
-                turns.give_back()
+                access.give_back()
             if reply is None:
                 continue
             error = reply.error

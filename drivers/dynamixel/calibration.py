@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from drivers.dynamixel.table import ControlTable
+from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.settings import RotatorSettings
 
 _LIMIT_MARGIN_DEG = 1.0

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from drivers.dynamixel.bus import ServoBus, ServoRefusedError
-from drivers.dynamixel.codec import Instruction, StatusError
-from drivers.dynamixel.table import Block, ControlTable, Register
+from graderd.drivers.dynamixel.bus import ServoBus, ServoRefusedError
+from graderd.drivers.dynamixel.codec import Instruction, StatusError
+from graderd.drivers.dynamixel.table import Block, ControlTable, Register
 from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError, WrongDeviceError
 
 EXTENDED_MODE, POSITION_MODE = 4, 3
 WATCHDOG_TRIPPED = -1
 WATCHDOG_STEP_S = 0.020
 _RUN_BYTES = 64
-PATIENT_N = 8
+ATTEMPTS_N = 8
 """Attempts of a request on which a whole procedure depends (opening, arming); polling has the next poll instead."""
 
 
@@ -57,21 +57,21 @@ class Ph54Device:
     async def read(self, name: str) -> int:
         """Value of one register in counts."""
         register = self.table[name]
-        packet = await self.bus.read(self.servo_id, register.address, register.size, attempts_n=PATIENT_N)
+        packet = await self.bus.read(self.servo_id, register.address, register.size, attempts_n=ATTEMPTS_N)
         return register.decode(packet.data)
 
-    async def read_block(self, block: Block, *, attempts_n: int = PATIENT_N) -> tuple[dict[str, int], bool]:
+    async def read_block(self, block: Block, *, attempts_n: int = ATTEMPTS_N) -> tuple[dict[str, int], bool]:
         """Values of neighbouring registers, and whether the servo's alert bit is set."""
         packet = await self.bus.read(self.servo_id, block.address, block.size, attempts_n=attempts_n)
         return block.decode(packet.data), packet.alert
 
-    async def write(self, name: str, value: int, *, attempts_n: int = PATIENT_N, urgent: bool = False) -> None:
+    async def write(self, name: str, value: int, *, attempts_n: int = ATTEMPTS_N, urgent: bool = False) -> None:
         """Write one register."""
         register, data = self.table[name], self.table[name].encode(value)
         await self.bus.write(self.servo_id, register.address, data, attempts_n=attempts_n, urgent=urgent)
 
     async def write_block(
-        self, block: Block, values: Mapping[str, int], *, attempts_n: int = PATIENT_N, urgent: bool = False
+        self, block: Block, values: Mapping[str, int], *, attempts_n: int = ATTEMPTS_N, urgent: bool = False
     ) -> None:
         """Write neighbouring registers in one packet: all of them take effect, or none."""
         data = block.encode(dict(values))
@@ -145,7 +145,7 @@ class Ph54Device:
         Raises:
             DeviceTimeoutError, DeviceLostError: the servo stopped answering.
         """
-        model, firmware = await self.bus.ping(self.servo_id, attempts_n=PATIENT_N)
+        model, firmware = await self.bus.ping(self.servo_id, attempts_n=ATTEMPTS_N)
         found: list[Difference] = []
         values: dict[str, int] = {"model_number": model}
         for run in _runs(self.table.registers):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 
-from drivers.dynamixel.bus import ServoBus
-from drivers.dynamixel.calibration import Calibration
-from drivers.dynamixel.detectors import MotionDetectors, Sample
-from drivers.dynamixel.device import WATCHDOG_TRIPPED, Ph54Device
-from drivers.dynamixel.faultbook import FaultBook
-from drivers.dynamixel.table import ControlTable
+from graderd.drivers.dynamixel.bus import ServoBus
+from graderd.drivers.dynamixel.calibration import Calibration
+from graderd.drivers.dynamixel.device import WATCHDOG_TRIPPED, Ph54Device
+from graderd.drivers.dynamixel.faultbook import FaultBook
+from graderd.drivers.dynamixel.motion_faults import MotionDetectors, Sample
+from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.clock import Clock
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry

@@ -12,16 +12,15 @@ import asyncio
 import logging
 from dataclasses import replace
 
-from drivers.dynamixel import arming
-from drivers.dynamixel.bus import BusLog
-from drivers.dynamixel.calibration import Calibration
-from drivers.dynamixel.command import CommandSlot
-from drivers.dynamixel.device import EXTENDED_MODE, POSITION_MODE, Difference
-from drivers.dynamixel.keeper import DEVICE, LINK_FAULTS, ServoKeeper
-from drivers.dynamixel.link import ServoLink, condition_of
-from drivers.dynamixel.observer import ServoObserver
-from drivers.dynamixel.ports import ListPorts, system_ports
-from drivers.dynamixel.table import ControlTable
+from graderd.drivers.dynamixel import arming
+from graderd.drivers.dynamixel.bus import BusLog
+from graderd.drivers.dynamixel.calibration import Calibration
+from graderd.drivers.dynamixel.connection import ServoLink, condition_of
+from graderd.drivers.dynamixel.device import EXTENDED_MODE, POSITION_MODE, Difference
+from graderd.drivers.dynamixel.observer import ServoObserver
+from graderd.drivers.dynamixel.serial_port import ListPorts, system_ports
+from graderd.drivers.dynamixel.servo_task import DEVICE, LINK_FAULTS, CommandSlot, ServoTask
+from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import (
     CommandRangeError,
@@ -65,7 +64,7 @@ class Ph54Rotator:
         self._link = ServoLink(settings, self.table, self._mode, self._clock, bus_log, list_ports)
         self._observer = ServoObserver(DEVICE, settings, self.table, self.calibration, self._clock)
         self._command = CommandSlot(settings, self.calibration)
-        self._keeper = ServoKeeper(settings, self._link, self._observer, self._command, self._clock)
+        self._keeper = ServoTask(settings, self._link, self._observer, self._command, self._clock)
 
     # -- what it is -------------------------------------------------------------------------------------------
 

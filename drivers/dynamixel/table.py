@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass, field
 from typing import Any
 
-import firmware_profiles
+from graderd import firmware_profiles
 
 _CODES = {1: "B", 2: "H", 4: "I"}
 

@@ -6,14 +6,22 @@ import asyncio
 import math
 from typing import Final
 
-from drivers.electrak.codec import Control, ElectrakCodec
-from drivers.electrak.link import CanLink
-from drivers.electrak.monitor import DISARMING, FAILING, INFORMATIVE, LATCHING, FaultMemory, FeedbackMonitor
-from drivers.electrak.overload import OverloadPolicy, Verdict
-from drivers.electrak.planner import MotionPlanner
-from drivers.electrak.profile import load_profile
-from drivers.electrak.thermal import ThermalGuard
-from drivers.electrak.track import RECOVERY_N, TRUST_N, FeedbackTrack
+from graderd.drivers.electrak.codec import Control, ElectrakCodec
+from graderd.drivers.electrak.motion_faults import (
+    DISARMING,
+    FAILING,
+    INFORMATIVE,
+    LATCHING,
+    RECOVERY_N,
+    TRUST_N,
+    FaultMemory,
+    FeedbackMonitor,
+    FeedbackTrack,
+)
+from graderd.drivers.electrak.planner import MotionPlanner
+from graderd.drivers.electrak.profile import load_profile
+from graderd.drivers.electrak.thermal import OverloadPolicy, ThermalGuard, Verdict
+from graderd.drivers.j1939.link import CanLink
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import (
     CommandRangeError,
@@ -322,10 +330,10 @@ class ElectrakActuator:
         age_s = now_s - max(self._track.feedback_at_s, self._opened_at_s)
         if age_s > self.settings.feedback_timeout_s:
             self._track.good_n = 0
-            strangers = [a for a in self._link.feedback_strangers(now_s) if 19 <= a <= 42]
+            unknown = [a for a in self._link.unknown_feedback_addresses(now_s) if 19 <= a <= 42]
             detail = f"no feedback from address {self.address} for {age_s:.2f} s"
-            if strangers and self._link.is_open:
-                heard = ", ".join(str(a) for a in strangers)
+            if unknown and self._link.is_open:
+                heard = ", ".join(str(a) for a in unknown)
                 self._faults.set("wrong_address", f"{detail}, but an actuator at address {heard} is heard", now_s)
             else:
                 self._faults.set("no_feedback", detail, now_s)
@@ -384,11 +392,11 @@ class ElectrakActuator:
 
     def _no_feedback_error(self) -> DeviceError:
         now_s = self._clock.now_s()
-        strangers = self._link.feedback_strangers(now_s)
+        unknown = self._link.unknown_feedback_addresses(now_s)
         cause = f"no feedback from address {self.address}"
         remedy = "Check its supply, the 120 ohm terminators and address_n"
-        if strangers:
-            remedy = f"Actuators are heard at address {', '.join(map(str, strangers))}: check address_n and select pins"
+        if unknown:
+            remedy = f"Actuators are heard at address {', '.join(map(str, unknown))}: check address_n and select pins"
         if self._link.address is None:
             cause, remedy = "graderd got no J1939 address", "Look at the can faults"
         return DeviceTimeoutError(self.name, f"{cause} within {WAKE_TIMEOUT_S:.0f} s", remedy)

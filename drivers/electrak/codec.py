@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import cantools.database
 from cantools.database.can import Database, Message
 
-from drivers.electrak.profile import read_layout
+from graderd.drivers.electrak.profile import read_layout
 from graderd.hal.errors import ProtocolError
 
 FACTORY_FILL: Final = 0

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from drivers.electrak.codec import Control
-from drivers.electrak.profile import Figures
+from graderd.drivers.electrak.codec import Control
+from graderd.drivers.electrak.profile import Figures
 
 LOOK_AHEAD_S: Final = 0.3
 _START_MARGIN_MM: Final = 0.3

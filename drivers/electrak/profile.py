@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from importlib import resources
 from typing import Any
 
-import firmware_profiles
+from graderd import firmware_profiles
 from graderd.hal.errors import WrongDeviceError
 
 

@@ -6,10 +6,10 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from drivers.electrak.codec import Control, ElectrakCodec
-from drivers.electrak.j1939.ids import Frame, Pgn, make_id
-from drivers.electrak.link import name_from
-from drivers.electrak.ports import PortFullError, PortLostError, open_port
+from graderd.drivers.electrak.codec import Control, ElectrakCodec
+from graderd.drivers.j1939.can_port import PortFullError, PortLostError, open_port
+from graderd.drivers.j1939.ids import Frame, Pgn, make_id
+from graderd.drivers.j1939.link import name_from
 from graderd.hal.errors import DeviceLostError
 from graderd.hal.settings import CanSettings
 

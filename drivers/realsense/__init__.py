@@ -1,8 +1,8 @@
 """The RealSense camera: live on USB, or from a recording; and plain pictures and videos from files."""
 
-from drivers.realsense.files import PICTURE_SUFFIXES, VIDEO_SUFFIXES, FolderCamera, VideoCamera
-from drivers.realsense.live import RealSenseCamera
-from drivers.realsense.recording import RecordingCamera
+from graderd.drivers.realsense.files import PICTURE_SUFFIXES, VIDEO_SUFFIXES, FolderCamera, VideoCamera
+from graderd.drivers.realsense.live import RealSenseCamera
+from graderd.drivers.realsense.recording import RecordingCamera
 
 RECORDING_SUFFIXES = frozenset({".db3", ".bag"})
 

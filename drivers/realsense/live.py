@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.realsense import sdk
+from graderd.drivers.realsense import sdk
 from graderd.hal.camera import Frame, Intrinsics
 from graderd.hal.errors import DeviceLostError, DeviceMissingError, DeviceTimeoutError, LifecycleError, WrongDeviceError
 from graderd.hal.settings import CameraSettings

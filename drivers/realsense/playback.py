@@ -8,7 +8,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.realsense import sdk
+from graderd.drivers.realsense import sdk
 from graderd.hal.camera import ColorImage, DepthImage, Intrinsics
 
 APART_S = 0.02

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from drivers.realsense.playback import Color, Depth, PacedPlayback, Playback, WholePlayback
+from graderd.drivers.realsense.playback import Color, Depth, PacedPlayback, Playback, WholePlayback
 from graderd.hal.camera import EndOfFrames, Frame
 from graderd.hal.errors import DeviceMissingError, DeviceTimeoutError, LifecycleError
 from graderd.hal.settings import CameraSettings

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivers.stop_input.gpio import GpioStopInput
-from drivers.stop_input.serial_line import SerialStopInput
-from drivers.stop_input.simulated import SimulatedStopInput, StopLoop
+from graderd.drivers.simulated.stop_input import SimulatedStopInput
+from graderd.drivers.stop_input.gpio import GpioStopInput
+from graderd.drivers.stop_input.serial_line import SerialStopInput
 from graderd.hal.settings import StopInputSettings
 from graderd.hal.stop_input import StopInput
 
@@ -22,4 +22,4 @@ def make_stop_input(settings: StopInputSettings) -> StopInput | None:
             return None
 
 
-__all__ = ["GpioStopInput", "SerialStopInput", "SimulatedStopInput", "StopLoop", "make_stop_input"]
+__all__ = ["GpioStopInput", "SerialStopInput", "SimulatedStopInput", "make_stop_input"]

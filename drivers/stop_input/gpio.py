@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from drivers.stop_input.loop import LoopStopInput
+from graderd.drivers.stop_input.loop import LoopStopInput
 from graderd.hal.errors import DeviceMissingError
 from graderd.hal.settings import StopInputSettings
 

@@ -12,7 +12,7 @@ from typing import Protocol
 
 import serial
 
-from drivers.stop_input.loop import LoopStopInput
+from graderd.drivers.stop_input.loop import LoopStopInput
 from graderd.hal.settings import StopInputSettings
 
 

@@ -10,9 +10,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from graderd.api.closing import Closing
 from graderd.api.http_routes import StatusTexts, http_routes
-from graderd.api.limiter import Limiter
+from graderd.api.limiter import Closing, Limiter
 from graderd.api.port import DaemonPort
 from graderd.api.problem import Problem, ProblemError, problem_of_validation
 from graderd.api.settings import ApiLimits

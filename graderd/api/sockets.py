@@ -12,8 +12,8 @@ from fastapi import APIRouter, Query, WebSocket
 from pydantic import TypeAdapter, ValidationError
 from starlette.websockets import WebSocketDisconnect
 
-from graderd.api.closing import Closing
 from graderd.api.http_routes import StatusTexts, obey
+from graderd.api.limiter import Closing
 from graderd.api.port import DaemonPort
 from graderd.api.problem import Problem, ProblemError, problem_of_validation
 from graderd.api.settings import ApiLimits

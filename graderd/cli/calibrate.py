@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from graderd.cli.client import daemon_of
-from graderd.cli.console import CliError, ExitCode, Json, plain_table, print_json, print_text
-from graderd.cli.epilog import example
+from graderd.cli.console import CliError, ExitCode, Json, example, plain_table, print_json, print_text
 from graderd.hal.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -194,7 +193,7 @@ def _picture(frames: FrameSet, result: CalibrationResult, path: Path) -> None:
     import cv2
     import numpy as np
 
-    from graderd.perception.calibration_picture import calibration_picture
+    from graderd.perception.annotate import calibration_picture
 
     middle = min(frames.entries, key=lambda entry: abs(entry.blade_angle_deg))
     widest = max(frames.entries, key=lambda entry: entry.blade_angle_deg)

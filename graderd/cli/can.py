@@ -10,11 +10,9 @@ from typing import Any
 import typer
 
 from graderd.cli.client import Daemon, daemon_of
-from graderd.cli.console import CliError, ExitCode
-from graderd.cli.epilog import example
-from graderd.cli.passthrough import TAKES_ANYTHING, hand_over
+from graderd.cli.console import TAKES_ANYTHING, CliError, ExitCode, example, hand_over
 
-_MODULE = "drivers.electrak.dump"
+_MODULE = "graderd.drivers.electrak.dump"
 
 
 def register(app: typer.Typer) -> None:
@@ -61,7 +59,7 @@ def is_the_daemons(daemon: Daemon, sources: list[str]) -> bool:
 
 def through(daemon: Daemon, options: list[str]) -> None:
     """Decode what the daemon hears and sends, until the daemon, the decoder's reader or the user ends it."""
-    command = [sys.executable, "-m", _MODULE, "-", *options]
+    command = [sys.executable, "-P", "-m", _MODULE, "-", *options]
     with (
         daemon.websocket("/v1/can") as stream,
         subprocess.Popen(command, stdin=subprocess.PIPE, bufsize=0) as decoder,

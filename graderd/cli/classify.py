@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from graderd.cli.console import CliError, ExitCode, Json, plain_table, print_error, print_json, print_text
-from graderd.cli.epilog import example
-from graderd.core.zones import SoilObservation, Zone
+from graderd.cli.console import CliError, ExitCode, Json, example, plain_table, print_error, print_json, print_text
+from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.errors import DeviceError, ProtocolError
 
 if TYPE_CHECKING:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from graderd.cli.console import CliError, Json, print_error, print_json, print_text
-from graderd.cli.epilog import example
+from graderd.cli.console import CliError, Json, example, print_error, print_json, print_text
 
 if TYPE_CHECKING:
     from graderd.config import Config

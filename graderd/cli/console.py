@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Sequence
 from enum import IntEnum
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 Row = Sequence[str]
@@ -103,3 +106,29 @@ def plain_table(title: str, header: Row, rows: Sequence[Row]) -> str:
     widths = [max((len(line[column]) for line in lines), default=0) for column in range(len(header))]
     body = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
     return "\n".join([title, *(f"  {line}" for line in body)] if title else body)
+
+
+def example(*lines: str) -> str:
+    """Examples for a command's help, one a line; blank lines keep the help from joining them."""
+    return "\n\n".join(["Example:" if len(lines) == 1 else "Examples:", *lines])
+
+
+TAKES_ANYTHING = {"allow_extra_args": True, "ignore_unknown_options": True, "allow_interspersed_args": False}
+
+
+def hand_over(module: str, arguments: list[str]) -> None:
+    """Become ``python -m module``: signals and the exit status are its own from here on.
+
+    Raises:
+        CliError: this installation has no such module.
+    """
+    try:
+        found = find_spec(module) is not None
+    except ModuleNotFoundError:
+        found = False
+    if not found:
+        raise CliError(module, "this installation does not contain it", "install the whole of graderd")
+    if arguments[:1] == ["--"]:
+        arguments = arguments[1:]
+    sys.stdout.flush()
+    os.execv(sys.executable, [sys.executable, "-P", "-m", module, *arguments])

@@ -13,8 +13,8 @@ from typer.main import get_command
 
 from graderd.cli.app import make_cli
 from graderd.cli.explain import lines
-from graderd.core.fault_catalogue import CATALOGUE
-from graderd.core.faults import Clear, FaultRow, Reaction
+from graderd.core.faults.catalogue import CATALOGUE
+from graderd.core.faults.monitor import Clear, FaultRow, Reaction
 
 HEADER = "<!-- Written by `python -m graderd.cli.docs`; change the source named below, not this page. -->\n"
 PARTS = {
@@ -59,7 +59,7 @@ def faults_page() -> str:
     """The fault catalogue for operators."""
     parts = [
         HEADER + "\n# Faults\n",
-        "What can go wrong, what the machine does about it, and what to do. Source: `graderd/core/fault_rows/`. The "
+        "What can go wrong, what the machine does about it, and what to do. Source: `graderd/core/faults/`. The "
         "same is printed by `graderd explain FAULT`, and the active faults stand in `graderd status`. In a fault's "
         "name, `actuator` is written for each of `lift_left`, `lift_right` and `tilt`.\n",
         "## What the machine does\n\nThe reactions in rising order; among several faults the highest counts. A "

@@ -7,10 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from graderd.cli.console import CliError, Json, print_json, print_table
-from graderd.cli.epilog import example
-from graderd.core.fault_catalogue import CATALOGUE, find_rows
-from graderd.core.faults import ACTUATORS, FaultRow
+from graderd.cli.console import CliError, Json, example, print_json, print_table
+from graderd.core.faults.catalogue import CATALOGUE, find_rows
+from graderd.core.faults.monitor import ACTUATORS, FaultRow
 
 
 def register(app: typer.Typer) -> None:

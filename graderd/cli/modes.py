@@ -8,8 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from graderd.cli.client import Daemon, client_name, daemon_of
-from graderd.cli.console import CliError, Json, print_json, print_table, print_text
-from graderd.cli.epilog import example
+from graderd.cli.console import CliError, Json, example, print_json, print_table, print_text
 
 ARMING_S = 8.0
 POLL_S = 0.05

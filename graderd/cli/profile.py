@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 
 from graderd.cli.client import daemon_of
-from graderd.cli.console import ExitCode, Json, print_json, print_table, print_text
-from graderd.cli.epilog import example
+from graderd.cli.console import ExitCode, Json, example, print_json, print_table, print_text
 
 SERVICE_S = 30.0
 

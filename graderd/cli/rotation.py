@@ -8,8 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from graderd.cli.client import daemon_of
-from graderd.cli.console import CliError, ExitCode, Json, for_people, print_json, print_table, print_text
-from graderd.cli.epilog import example
+from graderd.cli.console import CliError, ExitCode, Json, example, for_people, print_json, print_table, print_text
 
 SERVICE_S = 120.0
 Yes = Annotated[

@@ -13,6 +13,7 @@ from graderd.cli.client import Daemon, daemon_of
 from graderd.cli.console import (
     Json,
     Row,
+    example,
     for_people,
     plain_table,
     print_json,
@@ -20,7 +21,6 @@ from graderd.cli.console import (
     print_text,
     rich_table,
 )
-from graderd.cli.epilog import example
 
 THERMAL_SHOWN = 0.05
 Section = tuple[str, Row, list[Row]]

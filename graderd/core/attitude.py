@@ -46,18 +46,18 @@ class Attitude:
 
 def lift_attitude(geometry: AttitudeGeometry, left_mm: float, right_mm: float) -> Attitude:
     """Height and slope from the two lifts' extensions."""
-    sense = 1.0 if geometry.lift_raises_by_extending else -1.0
-    left_height = sense * geometry.lift_height_ratio * (left_mm - geometry.lift_ground_mm)
-    right_height = sense * geometry.lift_height_ratio * (right_mm - geometry.lift_ground_mm)
+    sign = 1.0 if geometry.lift_raises_by_extending else -1.0
+    left_height = sign * geometry.lift_height_ratio * (left_mm - geometry.lift_ground_mm)
+    right_height = sign * geometry.lift_height_ratio * (right_mm - geometry.lift_ground_mm)
     slope_deg = math.degrees(math.atan2(left_height - right_height, geometry.lift_spacing_mm))
     return Attitude((left_height + right_height) / 2.0, slope_deg)
 
 
 def lift_extensions(geometry: AttitudeGeometry, attitude: Attitude) -> tuple[float, float]:
     """Left and right lift extension (mm) for a height and slope; the inverse of :func:`lift_attitude`."""
-    sense = 1.0 if geometry.lift_raises_by_extending else -1.0
+    sign = 1.0 if geometry.lift_raises_by_extending else -1.0
     half = math.tan(math.radians(attitude.slope_deg)) * geometry.lift_spacing_mm / 2.0
-    scale = sense / geometry.lift_height_ratio
+    scale = sign / geometry.lift_height_ratio
     return (
         geometry.lift_ground_mm + scale * (attitude.height_mm + half),
         geometry.lift_ground_mm + scale * (attitude.height_mm - half),

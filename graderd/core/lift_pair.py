@@ -121,7 +121,7 @@ class _Side:
         return self.target_mm - self.start_mm
 
     @property
-    def sense(self) -> int:
+    def way_sign(self) -> int:
         """1 where the way of this move extends the lift, -1 where it retracts it."""
         return 1 if self.way_mm >= 0 else -1
 
@@ -227,7 +227,7 @@ class LiftPair:
         if stuck:
             return self._stop(stuck)
         deviations_mm = self._deviations_mm()
-        ahead_mm = [side.sense * deviation for side, deviation in zip(self._sides, deviations_mm, strict=True)]
+        ahead_mm = [side.way_sign * deviation for side, deviation in zip(self._sides, deviations_mm, strict=True)]
         self._apart_mm = abs(ahead_mm[0] - ahead_mm[1])
         if self._apart_mm > self._settings.stop_apart_mm:
             return self._stop(f"the sides are {self._apart_mm:.1f} mm apart")
@@ -296,7 +296,7 @@ class LiftPair:
         if all(abs(side.target_mm - side.position_mm) < settings.apart_mm for side in self._sides):
             self._waiting = None  # at the end each side finds its own rest
         elif self._waiting is None:
-            ahead_mm = [2.0 * d * s.sense for s, d in zip(self._sides, deviations_mm, strict=True)]
+            ahead_mm = [2.0 * d * s.way_sign for s, d in zip(self._sides, deviations_mm, strict=True)]
             index = 0 if ahead_mm[0] > ahead_mm[1] else 1
             far = ahead_mm[index] > settings.wait_mm and abs(self._sides[index].way_mm) > _MOVED_MM
             self._ahead_n = self._ahead_n + 1 if far else 0
@@ -337,7 +337,7 @@ class LiftPair:
             default=settings.full_speed_mm_per_s,
         )
         for side, gain, deviation_mm in zip(self._sides, gains, deviations_mm, strict=True):
-            ahead_mm = max(0.0, 2.0 * deviation_mm * side.sense)
+            ahead_mm = max(0.0, 2.0 * deviation_mm * side.way_sign)
             own_mm_per_s = pace_mm_per_s * (abs(side.way_mm) / longest_mm if longest_mm else 1.0)
             share = (own_mm_per_s - settings.catch_up_hz * ahead_mm) / gain
             side.share = min(max(share, settings.min_share), 1.0)

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from graderd.core import commands as cmd
-from graderd.core.faults import ALL_AXES, ActiveFault, Reaction, held_axes, worst
+from graderd.core.faults.monitor import ALL_AXES, ActiveFault, Reaction, held_axes, worst
 from graderd.core.rule import Decision, RuleSettings, decide
-from graderd.core.zones import SoilObservation
+from graderd.core.soil import SoilObservation
 from graderd.hal.settings import Positive, Settings
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from pydantic import Field, model_validator
 
-from graderd.core.zones import SoilObservation, Zone
+from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.settings import Finite, NotNegative, Settings
 
 TURNING_ZONES = (Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import BaseModel, ConfigDict
 
 from graderd.core.machine import Mode
-from graderd.core.zones import Zone
+from graderd.core.soil import Zone
 from graderd.hal.lifecycle import Lifecycle
 
 
@@ -111,7 +111,7 @@ class CameraStatus(_Status):
     lifecycle: Lifecycle = Lifecycle.CLOSED
     description: str = ""
     restarts_n: int = 0
-    rung: str = ""
+    recovery: str = ""
     settings_read_back: dict[str, float] = {}
 
 

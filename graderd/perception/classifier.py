@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import OrderedDict
 from typing import Protocol
@@ -9,18 +10,16 @@ from typing import Protocol
 import numpy as np
 
 from graderd.core.blade import BladeGeometry
-from graderd.core.zones import PictureFault, SoilObservation, Zone
+from graderd.core.soil import PictureFault, SoilObservation, Zone
 from graderd.hal.camera import Frame, Intrinsics
 from graderd.hal.settings import CameraSettings
 from graderd.perception import annotate as drawing
 from graderd.perception.color import fast_color_verdict, paper_verdict
-from graderd.perception.decide import Verdict
+from graderd.perception.decide import Verdict, fuse
 from graderd.perception.depth import DepthJudge, HeightMap
-from graderd.perception.fused import fuse
 from graderd.perception.geometry import CENTER, LEFT, RIGHT, U8, Region, View, blade_region, image_thirds
-from graderd.perception.health import HealthMonitor
-from graderd.perception.knock import KnockWatch
-from graderd.perception.settings import CameraCalibration, Mounting, PerceptionSettings
+from graderd.perception.health import HealthMonitor, KnockWatch
+from graderd.perception.settings import CameraCalibration, DecisionSettings, Mounting, PerceptionSettings
 
 ANGLE_STEP_DEG = 0.25
 KEPT_REGIONS_N = 64
@@ -238,3 +237,38 @@ def make_classifier(
     of it; a colour picture of another size is then a fault.
     """
     return SoilClassifier(settings, calibration, blade, live, mounting, camera)
+
+
+NEVER_S = 3600.0
+"""Age given to an angle that was never measured: finite, so that it survives JSON."""
+
+
+def judge_frame(
+    classifier: Classifier,
+    frame: Frame,
+    blade_angle_deg: float,
+    blade_angle_age_s: float,
+    now_s: float,
+    settings: DecisionSettings,
+) -> SoilObservation:
+    """The observation of one frame, with an old one never judged.
+
+    ``now_s``: monotonic seconds, on the clock of ``frame.capture_s``. A frame older than ``max_frame_age_s`` gives zone
+    UNKNOWN with the fault ``stale`` and no numbers. Who decides on the observation still compares ``capture_s`` with
+    its own clock: judging takes time too, see :meth:`graderd.core.soil.SoilObservation.as_of`.
+    """
+    age_s = now_s - frame.capture_s
+    angle_age_s = blade_angle_age_s if math.isfinite(blade_angle_age_s) else NEVER_S
+    if age_s > settings.max_frame_age_s:
+        detail = f"the frame is {age_s:.3f} s old, at most {settings.max_frame_age_s:.3f} s is accepted"
+        return SoilObservation(
+            capture_s=frame.capture_s,
+            zone=Zone.UNKNOWN,
+            confidence=0.0,
+            reason=detail,
+            blade_angle_deg=blade_angle_deg,
+            blade_angle_age_s=angle_age_s,
+            frame_number=frame.color_number,
+            faults=(PictureFault("stale", detail),),
+        )
+    return classifier.classify(frame, blade_angle_deg, angle_age_s)

@@ -31,7 +31,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from graderd.core.blade import BladeGeometry
-from graderd.core.zones import Zone
+from graderd.core.soil import Zone
 from graderd.hal.camera import ColorImage, DepthImage, EndOfFrames, Frame, Intrinsics, StreamPose
 from graderd.hal.errors import DeviceMissingError, LifecycleError, ProtocolError
 from graderd.hal.settings import CameraSettings

@@ -7,12 +7,15 @@ comes out of the registration (:mod:`graderd.perception.registration`) and is ju
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
-from graderd.core.zones import PictureFault
+from graderd.core.soil import PictureFault
 from graderd.hal.camera import Frame
 from graderd.hal.settings import CameraSettings
+from graderd.perception.depth import HeightMap
 from graderd.perception.geometry import F32, U8, Region
 from graderd.perception.registration import BladeFix, Ground
 from graderd.perception.settings import DepthSettings, HealthSettings
@@ -198,3 +201,27 @@ def _square_difference(lines: F32, distance: int) -> F32:
     """Mean square difference of pixels ``distance`` apart, per row."""
     difference = lines[:, distance:] - lines[:, :-distance]
     return np.asarray(np.einsum("ij,ij->i", difference, difference) / difference.shape[1], dtype=np.float32)
+
+
+CHECK_EVERY_N = 10
+"""At 30 frames a second the blade is looked for three times a second."""
+
+
+class KnockWatch:
+    """Looks now and then whether the blade is where it should be; one instance per stream of frames."""
+
+    def __init__(self, of_height_map: Callable[[HeightMap], list[PictureFault]]) -> None:
+        self._of_height_map = of_height_map
+        self._frame_n = 0
+        self._faults: list[PictureFault] = []
+
+    def check(self, height_map: Callable[[], HeightMap | None]) -> list[PictureFault]:
+        """The fault ``knocked`` as long as the last look found the camera moved.
+
+        ``height_map`` measures the frame's depth picture (None where it has none); called only when it is time to look.
+        """
+        if self._frame_n % CHECK_EVERY_N == 0:
+            soil = height_map()
+            self._faults = self._of_height_map(soil) if soil is not None else []
+        self._frame_n += 1
+        return list(self._faults)

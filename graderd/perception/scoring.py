@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from graderd.core.zones import SoilObservation, Zone
+from graderd.core.soil import SoilObservation, Zone
 
 PILES = (Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN)
 OPPOSITE = {Zone.LEFT: Zone.RIGHT, Zone.RIGHT: Zone.LEFT}

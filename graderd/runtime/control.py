@@ -10,21 +10,20 @@ from typing import Protocol
 
 from graderd.config import Config
 from graderd.core import commands as cmd
-from graderd.core.fault_catalogue import CATALOGUE
-from graderd.core.faults import Clear, FaultState, clear_faults, update_faults
+from graderd.core.faults.catalogue import CATALOGUE
+from graderd.core.faults.monitor import Clear, FaultState, clear_faults, update_faults
 from graderd.core.gate import AxisPass, GateInputs, GateState, pass_gate
 from graderd.core.lift import LiftCoordinator, height_mm
 from graderd.core.lift_pair import SideReading
 from graderd.core.machine import ARMED, Inputs, Intents, Mode, Pose, State, step
 from graderd.core.motion import resolve
-from graderd.core.zones import SoilObservation
+from graderd.core.soil import SoilObservation
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.reading import Reading
-from graderd.runtime.devices import ACTUATOR_NAMES, Devices
-from graderd.runtime.power import PowerKeeper
+from graderd.runtime.devices import ACTUATOR_NAMES, Devices, PowerSequencer
 from graderd.runtime.readiness import requirements
 from graderd.runtime.state_file import StateFile
 
@@ -83,7 +82,7 @@ class ControlLoop:
         self._state_file = state_file
         self._gate = GateState()
         self._lift = LiftCoordinator(config.lift_pair)
-        self._power = PowerKeeper(devices)
+        self._power = PowerSequencer(devices)
         self._queue: deque[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = deque()
         self._moving: set[str] = set()
         self._late: tuple[float, float] | None = None

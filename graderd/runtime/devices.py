@@ -1,12 +1,19 @@
-"""The devices the control loop works with, as contracts; built by ``graderd.runtime.app.devices``."""
+"""The devices the control loop works with, as contracts: opened, powered and held together.
+
+Built by ``graderd.runtime.app.devices``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from graderd.hal.errors import DeviceError
 from graderd.hal.fault import DeviceFault
+from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.rotator import Rotator
 
@@ -68,3 +75,114 @@ class Devices:
             except Exception:  # the stop path goes on to the next device whatever this one raised
                 failed.append(name)
         return tuple(failed)
+
+
+log = logging.getLogger(__name__)
+
+
+class PowerSequencer:
+    """``want(True)`` arms all devices once, ``want(False)`` disarms those that are active. Nothing is retried here:
+    a failed arming is reported once through :meth:`take_error` and the machine goes back to disarmed."""
+
+    def __init__(self, devices: Devices) -> None:
+        self._devices = devices
+        self._wanted = False
+        self._task: asyncio.Task[None] | None = None
+        self._error = ""
+
+    @property
+    def all_active(self) -> bool:
+        """Whether every device is ACTIVE and none is being armed or disarmed."""
+        busy = self._task is not None and not self._task.done()
+        return not busy and all(d.lifecycle is Lifecycle.ACTIVE for d in self._devices.all().values())
+
+    def take_error(self) -> str:
+        """Why arming failed, once."""
+        error, self._error = self._error, ""
+        return error
+
+    def want(self, power: bool) -> None:
+        """Called every tick; starts a task only on a change, or where an active device should not be."""
+        busy = self._task is not None and not self._task.done()
+        stray = not power and any(d.lifecycle is Lifecycle.ACTIVE for d in self._devices.all().values())
+        if power == self._wanted and not (stray and not busy):
+            return
+        if busy and self._task is not None:
+            if power == self._wanted:
+                return
+            self._task.cancel()
+        self._wanted = power
+        work = self._arm_all(self._task) if power else self._disarm_all(self._task)
+        self._task = asyncio.get_running_loop().create_task(work, name=f"power-{'on' if power else 'off'}")
+
+    async def _arm_all(self, former: asyncio.Task[None] | None) -> None:
+        await _finished(former)
+        for name, device in self._devices.all().items():
+            try:
+                if device.lifecycle is Lifecycle.ACTIVE:
+                    await device.disarm()  # left over from before: arming anew writes and verifies everything
+                await device.arm()
+            except DeviceError as error:
+                log.warning("arming %s failed: %s", name, error)
+                self._error = str(error)
+                return
+
+    async def _disarm_all(self, former: asyncio.Task[None] | None) -> None:
+        await _finished(former)
+        self._error = ""
+        for name, device in self._devices.all().items():
+            try:
+                if device.lifecycle is Lifecycle.ACTIVE:
+                    await device.disarm()
+            except DeviceError as error:
+                # The device keeps its own dead man; the fault it reports says the rest.
+                log.warning("disarming %s failed: %s", name, error)
+
+    async def close(self) -> None:
+        """End the task under way."""
+        if self._task is not None:
+            self._task.cancel()
+            await _finished(self._task)
+
+
+async def _finished(task: asyncio.Task[None] | None) -> None:
+    """Wait for a cancelled or ending task, whatever became of it."""
+    if task is not None:
+        await asyncio.gather(task, return_exceptions=True)
+
+
+RETRY_S = 1.0
+
+log = logging.getLogger(__name__)
+
+
+async def open_devices(devices: Devices, problems: dict[str, str]) -> None:
+    """Open the bus, then all axes side by side; every failure is told once per cause and tried again.
+
+    ``problems``: why a device is not open yet, by name; kept up to date here.
+    """
+    async with asyncio.TaskGroup() as group:
+        group.create_task(_keep_trying("rotation", devices.rotation.open, problems), name="open-rotation")
+        group.create_task(_open_bus(devices, problems), name="open-can")
+
+
+async def _open_bus(devices: Devices, problems: dict[str, str]) -> None:
+    await _keep_trying("can", devices.link.open, problems)
+    async with asyncio.TaskGroup() as group:
+        for name, actuator in devices.actuators.items():
+            group.create_task(_keep_trying(name, actuator.open, problems), name=f"open-{name}")
+
+
+async def _keep_trying(name: str, open_device: Callable[[], Awaitable[None]], problems: dict[str, str]) -> None:
+    while True:
+        try:
+            await open_device()
+        except DeviceError as error:
+            if problems.get(name) != str(error):
+                log.warning("%s: cannot be opened: %s", name, error)
+                problems[name] = str(error)
+            await asyncio.sleep(RETRY_S)
+        else:
+            problems.pop(name, None)
+            log.info("%s: open", name)
+            return

@@ -13,7 +13,7 @@ from graderd.core.machine import Mode
 from graderd.core.status import Status
 from graderd.hal.errors import DeviceError
 from graderd.runtime.control import ControlLoop
-from graderd.runtime.perception import PerceptionWorker
+from graderd.runtime.perception_supervisor import PerceptionSupervisor
 from graderd.runtime.status import build_status
 
 Service = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
@@ -27,7 +27,7 @@ SERVICES_IN_ANY_MODE = frozenset({"rotation.verify_profile"})
 class Port:
     """Status is built once per tick and only when somebody waits for it."""
 
-    def __init__(self, loop: ControlLoop, eyes: PerceptionWorker, services: Mapping[str, Service]) -> None:
+    def __init__(self, loop: ControlLoop, eyes: PerceptionSupervisor, services: Mapping[str, Service]) -> None:
         self._loop = loop
         self._services = services
         self._eyes = eyes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from graderd.core.faults import ActiveFault, Clear, Reaction
+from graderd.core.faults.monitor import ActiveFault, Clear, Reaction
 from graderd.core.machine import Mode, Unmet
 from graderd.hal.lifecycle import Lifecycle
 

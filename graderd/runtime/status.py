@@ -22,13 +22,13 @@ from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import Rotator
 from graderd.runtime.control import ControlLoop
-from graderd.runtime.perception import PerceptionWorker
+from graderd.runtime.perception_supervisor import PerceptionSupervisor
 from graderd.runtime.readiness import requirements
 
 VERSION = version("graderd")
 
 
-def build_status(loop: ControlLoop, eyes: PerceptionWorker) -> Status:
+def build_status(loop: ControlLoop, eyes: PerceptionSupervisor) -> Status:
     """The state at the last tick."""
     now_s = loop.time_s
     state = loop.state
@@ -86,7 +86,7 @@ def build_status(loop: ControlLoop, eyes: PerceptionWorker) -> Status:
     )
 
 
-def _soil(eyes: PerceptionWorker, now_s: float) -> SoilStatus:
+def _soil(eyes: PerceptionSupervisor, now_s: float) -> SoilStatus:
     newest = eyes.newest
     if newest is None:
         return SoilStatus()

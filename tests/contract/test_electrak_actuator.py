@@ -14,9 +14,8 @@ from pathlib import Path
 import can
 import pytest
 
-from drivers.electrak import CanLink, ElectrakActuator
-from drivers.electrak.ports import BusPort
-from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
+from graderd.drivers.electrak import CanLink, ElectrakActuator
+from graderd.drivers.j1939.can_port import BusPort
 from graderd.hal.errors import (
     CommandRangeError,
     DeviceMissingError,
@@ -28,8 +27,9 @@ from graderd.hal.errors import (
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.settings import ActuatorSettings, CanSettings
+from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
+from tests.awake_clock import AwakeClock
 from tests.electrak_sim import until
-from tests.patience import PatientClock
 
 VCAN = next((path.name for path in sorted(Path("/sys/class/net").glob("vcan*"))), None)
 WIRES = ["in_process", "python_can_virtual", "slcan_pty", *([VCAN] if VCAN else [])]
@@ -39,7 +39,7 @@ class Bench:
     """One virtual actuator, the link and the driver under test."""
 
     def __init__(self, wire: str, tmp_path: Path) -> None:
-        self.clock = PatientClock()
+        self.clock = AwakeClock()
         self.unit = VirtualElectrak(position_mm=100.0, seed=5)
         self.external: can.BusABC | None = None
         self.bus: VirtualActuatorBus

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from graderd.core.blade import BladeGeometry
-from graderd.core.zones import Zone
+from graderd.core.soil import Zone
 from graderd.hal.camera import Frame
 from graderd.perception import METHODS, CameraCalibration, Method, PerceptionSettings
 from graderd.perception.classifier import make_classifier

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from drivers.realsense import RealSenseCamera, sdk
-from drivers.realsense.live import attached
+from graderd.drivers.realsense import RealSenseCamera, sdk
+from graderd.drivers.realsense.live import attached
 from graderd.hal.errors import (
     DeviceLostError,
     DeviceMissingError,
@@ -232,7 +232,7 @@ def test_hardware_reset_waits_until_the_camera_is_back(monkeypatch: pytest.Monke
     device = Device()
     looks = iter([[device], [device], [], [], [device]])
     camera = RealSenseCamera(settings(), lambda: next(looks))
-    monkeypatch.setattr("drivers.realsense.live.time.sleep", lambda _s: None)
+    monkeypatch.setattr("graderd.drivers.realsense.live.time.sleep", lambda _s: None)
     camera.reset_hardware()
     assert device.resets == 1
     with pytest.raises(StopIteration):

@@ -12,9 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.rig.camera import RigCamera
-from drivers.rig.control import RigControl
-from drivers.rig.server import Rig
+from graderd.drivers.simulated.camera import RigCamera
 from graderd.hal.camera import Camera, Frame
 from graderd.hal.errors import (
     DeviceLostError,
@@ -24,6 +22,8 @@ from graderd.hal.errors import (
     WrongDeviceError,
 )
 from graderd.hal.settings import CameraSettings
+from graderd.simulator.control_client import RigControl
+from graderd.simulator.process import Rig
 
 READY_S = 30.0
 

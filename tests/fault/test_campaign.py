@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from graderd.core.fault_catalogue import CATALOGUE
-from graderd.core.faults import catalogue_key
+from graderd.core.faults.catalogue import CATALOGUE
+from graderd.core.faults.monitor import catalogue_key
 from tests.fault.campaign.__main__ import CASES, about, chosen, joined
 from tests.fault.campaign.daemon import BREAKS
 from tests.fault.campaign.model import Outcome, Phase

@@ -13,14 +13,14 @@ from pathlib import Path
 import can
 import pytest
 
-from drivers.electrak import CanLink, ElectrakActuator, dump
-from drivers.electrak.bus_events import BusEvent, event_of
-from drivers.electrak.j1939.ids import Frame, Pgn, make_id, pgn_of
-from drivers.electrak.ports import PortLostError, SlcanPort, SocketCanPort, lost_from
-from drivers.electrak.slcan_bus import QuietSlcanBus
-from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
+from graderd.drivers.electrak import CanLink, ElectrakActuator, dump
+from graderd.drivers.j1939.bus_health import BusEvent, event_of
+from graderd.drivers.j1939.can_port import PortLostError, SlcanPort, SocketCanPort, lost_from
+from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of
+from graderd.drivers.j1939.slcan_bus import QuietSlcanBus
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import ActuatorSettings, CanSettings
+from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from tests.electrak_sim import conditions, state, until
 
 # -- the slcan adapter, in real time ----------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from drivers.rig.control import RigControl
+from graderd.simulator.control_client import RigControl
 from tests.machine import Machine, machine
 
 pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(240)]

@@ -13,19 +13,19 @@ from pathlib import Path
 
 import pytest
 
-from drivers.dynamixel import safe_off
-from drivers.dynamixel.arming import watchdog_counts
-from drivers.dynamixel.virtual import VirtualServo, VirtualServoBus
+from graderd.drivers.dynamixel import safe_off
+from graderd.drivers.dynamixel.arming import watchdog_counts
 from graderd.hal.errors import DeviceMissingError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import RotatorSettings
+from graderd.simulator.servo import VirtualServo, VirtualServoBus
+from tests.awake_clock import AwakeClock
 from tests.dynamixel_sim import PATIENCE_S, bench, servo_process, until
-from tests.patience import PatientClock
 
 # A daemon in miniature: arms, turns for ever, says when it is under way.
 CLIENT = """
 import asyncio, sys
-from drivers.dynamixel import Ph54Rotator
+from graderd.drivers.dynamixel import Ph54Rotator
 from graderd.hal.settings import RotatorSettings
 async def main():
     r = Ph54Rotator(RotatorSettings(port=sys.argv[1], velocity_deg_per_s=20.0))
@@ -51,7 +51,7 @@ def test_from_loss_of_link_to_standstill_the_watchdog_bounds_it(
         try:
             assert client.stdout is not None
             assert client.stdout.readline() == "moving\n"
-            clock = PatientClock()
+            clock = AwakeClock()
             lost_s = clock.now_s()
             if way == "unplugged":
                 servo.tell("unplug")
@@ -175,7 +175,7 @@ def test_the_virtual_servo_alone_takes_commands_and_leaves_nothing_behind(tmp_pa
     assert not servo.link.exists()
     assert not servo.link.is_symlink()
     bad = subprocess.run(
-        [sys.executable, "-m", "drivers.dynamixel.virtual", "--link", str(tmp_path / "x"), "--baud", "1234"],
+        [sys.executable, "-m", "graderd.simulator.servo", "--link", str(tmp_path / "x"), "--baud", "1234"],
         capture_output=True,
         text=True,
         check=False,

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from drivers.dynamixel.virtual import FAULTS, VirtualServo
 from graderd.hal.errors import DeviceError, DeviceRefusedError
 from graderd.hal.lifecycle import Lifecycle
+from graderd.simulator.servo import FAULTS, VirtualServo
 from tests.dynamixel_sim import Bench, armed_at, bench, standing, works_again
 
 ALERTS = sorted(name for name in FAULTS if name.startswith("alert_"))

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from drivers.dynamixel import Ph54Rotator
-from drivers.dynamixel.keeper import ServoKeeper
-from drivers.dynamixel.virtual import VirtualServo, VirtualServoBus
+from graderd.drivers.dynamixel import Ph54Rotator
+from graderd.drivers.dynamixel.servo_task import ServoTask
 from graderd.hal.errors import DeviceError, DeviceMissingError, DeviceRefusedError, DeviceTimeoutError, WrongDeviceError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import RotatorSettings
+from graderd.simulator.servo import VirtualServo, VirtualServoBus
 from tests.dynamixel_sim import Bench, bench, standing, until, works_again
 
 
@@ -145,7 +145,7 @@ async def test_the_servo_task_comes_back_when_it_is_killed(rig: Bench) -> None:
 
 async def test_an_unexpected_exception_does_not_end_the_search(rig: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(ServoKeeper, "_cycle", lambda *_, **__: 1 / 0)
+        patch.setattr(ServoTask, "_cycle", lambda *_, **__: 1 / 0)
         await rig.until(lambda: rig.rotator.lifecycle is Lifecycle.FAILED)
     await works_again(rig)
 

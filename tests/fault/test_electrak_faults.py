@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from drivers.electrak import ElectrakActuator
-from drivers.electrak.j1939.ids import Frame, Pgn, make_id
-from drivers.electrak.profile import load_profile
-from drivers.electrak.virtual import VirtualElectrak
+from graderd.drivers.electrak import ElectrakActuator
+from graderd.drivers.electrak.profile import load_profile
+from graderd.drivers.j1939.ids import Frame, Pgn, make_id
 from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CanSettings
+from graderd.simulator.actuators import VirtualElectrak
 from tests.electrak_sim import Machine, SimulatedLoop, run_simulated
 
 LEFT = ("lift_left",)

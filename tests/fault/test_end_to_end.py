@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.rig.control import RigControl
+from graderd.simulator.control_client import RigControl
 from tests.machine import READY_S, machine, start_rig
 
 pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(240)]

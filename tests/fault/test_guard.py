@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from drivers.dynamixel.calibration import Calibration
-from drivers.dynamixel.virtual import VirtualServo, VirtualServoBus
-from drivers.electrak.codec import Control, ElectrakCodec
-from drivers.electrak.j1939.ids import Frame, Pgn, make_id
-from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
+from graderd.drivers.dynamixel.calibration import Calibration
+from graderd.drivers.electrak.codec import Control, ElectrakCodec
+from graderd.drivers.j1939.ids import Frame, Pgn, make_id
 from graderd.hal.settings import RotatorSettings
+from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
+from graderd.simulator.servo import VirtualServo, VirtualServoBus
 from tests.fault.campaign.conduct import EVERYTHING, come_to
 from tests.fault.campaign.model import Phase
 from tests.fault.campaign.stack import Stack

@@ -8,7 +8,7 @@ import itertools
 
 import pytest
 
-from drivers.electrak.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
+from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CanSettings
 from tests.electrak_sim import Machine, SimulatedLoop, conditions, run_simulated, state

@@ -9,12 +9,12 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 from graderd.core.blade import BladeGeometry
-from graderd.core.zones import Zone
+from graderd.core.soil import Zone
 from graderd.hal.clock import SystemClock
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
-from graderd.runtime.perception import PerceptionWorker
+from graderd.runtime.perception_supervisor import PerceptionSupervisor
 
 CAMERA = CameraSettings(source="rig", path="nowhere", stale_s=0.3, restart_s=0.8)
 DEADLINE_S = 20.0
@@ -35,11 +35,11 @@ def frame(n=0, faults=()):
 
 
 @asynccontextmanager
-async def worker(tmp_path: Path, body: str, camera: CameraSettings = CAMERA) -> AsyncIterator[PerceptionWorker]:
+async def worker(tmp_path: Path, body: str, camera: CameraSettings = CAMERA) -> AsyncIterator[PerceptionSupervisor]:
     """A supervised child that runs ``body`` after the prelude."""
     script = tmp_path / "child.py"
     script.write_text(f"LOG = {str(tmp_path / 'starts')!r}\n" + PRELUDE + body, encoding="utf-8")
-    eyes = PerceptionWorker(
+    eyes = PerceptionSupervisor(
         camera,
         CameraCalibration(),
         PerceptionSettings(),
@@ -64,7 +64,7 @@ async def until(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0.01)
 
 
-def conditions(eyes: PerceptionWorker) -> set[str]:
+def conditions(eyes: PerceptionSupervisor) -> set[str]:
     return {fault.condition for fault in eyes.faults()}
 
 
@@ -106,17 +106,17 @@ async def test_a_library_call_that_never_returns_at_the_start(tmp_path: Path) ->
 
 
 async def test_the_hardware_is_reset_before_the_third_open_and_told(tmp_path: Path) -> None:
-    body = 'say(kind="trouble", condition="missing", message="no RealSense camera", final=True)\nsys.exit(4)\n'
+    body = 'say(kind="problem", condition="missing", message="no RealSense camera", final=True)\nsys.exit(4)\n'
     async with worker(tmp_path, body) as eyes:
         await until(lambda: len(starts(tmp_path)) >= 4)
         assert ['"reset": true' in line for line in starts(tmp_path)[:4]] == [False, False, True, False]
-        await until(lambda: "camera reset" in eyes.status().rung)
+        await until(lambda: "camera reset" in eyes.status().recovery)
         (missing,) = [fault for fault in eyes.faults() if fault.condition == "missing"]
         assert missing.detail == "no RealSense camera"
 
 
 async def test_alive_but_without_frames_goes_up_the_ladder_too(tmp_path: Path) -> None:
-    body = 'opened()\nwhile True:\n    say(kind="trouble", condition="stale", message="no frame"); time.sleep(0.1)\n'
+    body = 'opened()\nwhile True:\n    say(kind="problem", condition="stale", message="no frame"); time.sleep(0.1)\n'
     async with worker(tmp_path, body) as eyes:
         await until(lambda: len(starts(tmp_path)) >= 2)
         assert "stale" in conditions(eyes)

@@ -13,10 +13,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from drivers.rig.camera import RigCamera
-from drivers.rig.control import rig_request
+from graderd.drivers.simulated.camera import RigCamera
 from graderd.hal.errors import DeviceLostError, DeviceMissingError
 from graderd.hal.settings import CameraSettings
+from graderd.simulator.control_client import rig_request
 from tests.rig_process import running_rig
 
 pytestmark = pytest.mark.serial_only
@@ -99,7 +99,7 @@ def test_rig_ends_cleanly_on_a_signal(tmp_path: Path, number: signal.Signals) ->
 def test_rig_whose_camera_dies_says_so_and_ends(tmp_path: Path) -> None:
     directory = tmp_path / "rig"
     process = subprocess.Popen(
-        [sys.executable, "-m", "drivers.rig", "--dir", str(directory)], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "graderd.simulator", "--dir", str(directory)], stderr=subprocess.PIPE, text=True
     )
     try:
         deadline_s = time.monotonic() + 40.0
@@ -127,7 +127,7 @@ def test_rig_whose_camera_dies_says_so_and_ends(tmp_path: Path) -> None:
 def test_rig_bad_arguments(tmp_path: Path, arguments: list[str], message: str) -> None:
     directory = ["--dir", str(tmp_path / "rig")] if arguments else []
     result = subprocess.run(
-        [sys.executable, "-m", "drivers.rig", *directory, *arguments], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "graderd.simulator", *directory, *arguments], capture_output=True, text=True, timeout=60
     )
     assert result.returncode == 2
     assert message in result.stderr
@@ -135,7 +135,7 @@ def test_rig_bad_arguments(tmp_path: Path, arguments: list[str], message: str) -
 
 async def test_the_rig_quits_when_the_program_that_started_it_is_gone(tmp_path: Path) -> None:
     rig = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "drivers.rig", "--dir", str(tmp_path), "--linger-s", "0.2"),
+        *(sys.executable, "-m", "graderd.simulator", "--dir", str(tmp_path), "--linger-s", "0.2"),
         stdin=asyncio.subprocess.PIPE,
     )
     assert rig.stdin is not None

@@ -17,7 +17,7 @@ import pytest
 from graderd.config import Config
 from graderd.core import commands as cmd
 from graderd.core.machine import Mode
-from graderd.core.zones import SoilObservation, Zone
+from graderd.core.soil import SoilObservation, Zone
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.state_file import StateFile
 from tests.fakes import FakeMachine

@@ -14,12 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.electrak.candump import candump_line, parse_candump_line
-from drivers.electrak.decode import FrameDecoder
-from drivers.electrak.dump import dump, main, read_file, text_of
-from drivers.electrak.j1939.dm1 import dtc_of, encode
-from drivers.electrak.j1939.ids import Frame, Pgn, make_id
-from drivers.electrak.j1939.transport import Transport
+from graderd.drivers.electrak.dump import FrameDecoder, candump_line, dump, main, parse_candump_line, read_file, text_of
+from graderd.drivers.j1939.dm1 import dtc_of, encode
+from graderd.drivers.j1939.ids import Frame, Pgn, make_id
+from graderd.drivers.j1939.transport import Transport
 from graderd.hal.errors import ProtocolError
 
 FRAMES = [
@@ -196,7 +194,7 @@ def test_a_truncated_log_gives_what_it_holds(tmp_path: Path) -> None:
 def test_the_command_line_writes_json_and_survives_a_closed_pipe(tmp_path: Path) -> None:
     path = tmp_path / "trip.log"
     path.write_text(candump_compact(0.0) * 3000)
-    command = f"{sys.executable} -m drivers.electrak.dump {path} --json | head -n 2"
+    command = f"{sys.executable} -m graderd.drivers.electrak.dump {path} --json | head -n 2"
     done = subprocess.run(["bash", "-c", f"set -o pipefail; {command}"], capture_output=True, text=True, check=False)
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert [line["name"] for line in lines] == ["ACM", "AFM"]
@@ -206,7 +204,7 @@ def test_the_command_line_writes_json_and_survives_a_closed_pipe(tmp_path: Path)
 def test_candump_text_on_standard_input_is_read_and_what_is_written_is_read_again() -> None:
     text = "# 2 frames lost: the reader is too slow\n" + "".join(f"{candump_line(f, t)}\n" for t, f in FRAMES)
     done = subprocess.run(
-        [sys.executable, "-m", "drivers.electrak.dump", "-", "--json"],
+        [sys.executable, "-m", "graderd.drivers.electrak.dump", "-", "--json"],
         input=text, capture_output=True, text=True, check=True,
     )  # fmt: skip
     objects = [json.loads(line) for line in done.stdout.splitlines()]

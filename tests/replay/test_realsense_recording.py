@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.realsense import RecordingCamera
 from graderd.core.blade import BladeGeometry
-from graderd.core.zones import Zone
+from graderd.core.soil import Zone
+from graderd.drivers.realsense import RecordingCamera
 from graderd.hal.camera import EndOfFrames, Frame
 from graderd.hal.errors import DeviceMissingError, DeviceTimeoutError, LifecycleError
 from graderd.hal.settings import CameraSettings

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from drivers.rig.camera import RigCamera
-from drivers.rig.control import RigControl
+from graderd.drivers.simulated.camera import RigCamera
 from graderd.hal.settings import CameraSettings
+from graderd.simulator.control_client import RigControl
 from tests.machine import machine, start_rig
 from tests.realsense_devices import SoftD455, record
 

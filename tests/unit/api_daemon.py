@@ -15,7 +15,7 @@ from graderd.api.port import ServiceError
 from graderd.api.server import serve
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.core import commands as cmd
-from graderd.core.faults import ActiveFault
+from graderd.core.faults.monitor import ActiveFault
 from graderd.core.machine import Goals, Inputs, Lease, MachineSettings, Mode, Pose, State, Unmet, step
 from graderd.core.rule import RuleSettings
 from graderd.core.status import (
@@ -28,7 +28,7 @@ from graderd.core.status import (
     Status,
 )
 from graderd.hal.lifecycle import Lifecycle
-from tests.patience import PatientClock
+from tests.awake_clock import AwakeClock
 
 T = TypeVar("T")
 
@@ -60,7 +60,7 @@ class FakeDaemon:
 
     def __post_init__(self) -> None:
         self.waiting: list[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = []
-        self._clock = PatientClock()
+        self._clock = AwakeClock()
         self._ticked = asyncio.Event()
         self._moving: set[str] = set()
         self._goals = Goals()

@@ -17,9 +17,8 @@ import httpx
 import pytest
 
 from graderd.api.app import make_app
-from graderd.api.listeners import SocketError, SocketInUseError
 from graderd.api.port import DaemonPort
-from graderd.api.server import serve
+from graderd.api.server import SocketError, SocketInUseError, serve
 from graderd.api.settings import ApiLimits
 from graderd.core.machine import Mode, Unmet
 from graderd.core.status import Status

@@ -14,10 +14,9 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
 from graderd.api.app import make_app
-from graderd.api.guard import load_or_make_token
-from graderd.api.listeners import SocketError
-from graderd.api.server import serve
+from graderd.api.server import SocketError, serve
 from graderd.api.settings import TcpSettings
+from graderd.api.tcp_guard import load_or_make_token
 from graderd.hal.errors import DeviceError
 from tests.unit.api_daemon import FakeDaemon, serving, within
 

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from drivers.electrak import ElectrakActuator
 from graderd.core.attitude import (
     Attitude,
     AttitudeGeometry,
@@ -21,6 +20,7 @@ from graderd.core.attitude import (
     tilt_extension,
 )
 from graderd.core.lift_pair import LiftPair, LiftPairSettings, SideReading
+from graderd.drivers.electrak import ElectrakActuator
 from tests.electrak_sim import Machine, SimulatedLoop, run_simulated
 
 GEOMETRY = AttitudeGeometry()

@@ -11,7 +11,7 @@ import pytest
 
 from graderd.cli.app import run_app
 from graderd.core.blade import BladeGeometry
-from graderd.core.zones import Zone
+from graderd.core.soil import Zone
 from graderd.perception import METHODS, CameraCalibration
 from graderd.perception.frame_set import Entry, FrameSetWriter
 from graderd.perception.settings import StreamCalibration

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from graderd.api.settings import ApiLimits
 from graderd.cli.console import CliError
-from graderd.cli.jog import UNITS, VALUE, Arrival, JogValue, parse_value
+from graderd.cli.move import UNITS, VALUE, Arrival, JogValue, parse_value
 from graderd.core.machine import Mode
 from graderd.core.status import FaultStatus
 from tests.unit.api_daemon import FakeDaemon, serving, within

@@ -13,7 +13,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from graderd.cli.app import make_cli, run_app
-from graderd.core.fault_catalogue import CATALOGUE
+from graderd.core.faults.catalogue import CATALOGUE
 from tests.unit.api_daemon import serving
 from tests.unit.test_cli_modes import Capture, cli
 
@@ -102,30 +102,31 @@ def test_config_show_prints_a_file_that_is_valid_again(tmp_path: Path, capsys: C
 @pytest.mark.parametrize(
     ("arguments", "module", "handed"),
     [
-        (["rig", "--dir", "d", "--seed", "1"], "drivers.rig", ["--dir", "d", "--seed", "1"]),
-        (["rig", "dataset", "--out", "x"], "drivers.rig.dataset", ["--out", "x"]),
-        (["rig", "--", "--help"], "drivers.rig", ["--help"]),
-        (["rig", "dataset", "--help"], "drivers.rig.dataset", ["--help"]),
-        (["rig", "dataset", "--", "--help"], "drivers.rig.dataset", ["--help"]),
-        (["can", "dump", "can0", "--json"], "drivers.electrak.dump", ["can0", "--json"]),
-        (["can", "dump", "--", "--help"], "drivers.electrak.dump", ["--help"]),
+        (["rig", "--dir", "d", "--seed", "1"], "graderd.simulator", ["--dir", "d", "--seed", "1"]),
+        (["rig", "dataset", "--out", "x"], "graderd.simulator.dataset", ["--out", "x"]),
+        (["rig", "--", "--help"], "graderd.simulator", ["--help"]),
+        (["rig", "dataset", "--help"], "graderd.simulator.dataset", ["--help"]),
+        (["rig", "dataset", "--", "--help"], "graderd.simulator.dataset", ["--help"]),
+        (["can", "dump", "can0", "--json"], "graderd.drivers.electrak.dump", ["can0", "--json"]),
+        (["can", "dump", "--", "--help"], "graderd.drivers.electrak.dump", ["--help"]),
+        (["demo", "--json"], "graderd.simulator.demo", ["--json"]),
     ],
 )
 def test_hand_overs(monkeypatch: pytest.MonkeyPatch, arguments: list[str], module: str, handed: list[str]) -> None:
     became: list[list[str]] = []
-    monkeypatch.setattr("graderd.cli.passthrough.os.execv", lambda _, argv: became.append(argv))
-    monkeypatch.setattr("graderd.cli.passthrough.find_spec", lambda _: object())
+    monkeypatch.setattr("graderd.cli.console.os.execv", lambda _, argv: became.append(argv))
+    monkeypatch.setattr("graderd.cli.console.find_spec", lambda _: object())
     assert run_app(arguments) == 0
-    assert became == [[sys.executable, "-m", module, *handed]]
+    assert became == [[sys.executable, "-P", "-m", module, *handed]]
 
 
 def test_a_program_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    monkeypatch.setattr("graderd.cli.passthrough.find_spec", lambda _: None)
+    monkeypatch.setattr("graderd.cli.console.find_spec", lambda _: None)
     assert run_app(["rig"]) == 1
     assert "does not contain it" in capsys.readouterr().err
 
 
-def test_run_demo_and_guard_give_the_daemons_exit_status(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+def test_run_and_guard_give_the_daemons_exit_status(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     calls: list[tuple[Any, ...]] = []
 
     def fake(name: str, status: int) -> Any:
@@ -136,14 +137,11 @@ def test_run_demo_and_guard_give_the_daemons_exit_status(monkeypatch: pytest.Mon
         return called
 
     monkeypatch.setattr("graderd.runtime.app.run_daemon", fake("daemon", 1))
-    monkeypatch.setattr("graderd.runtime.app.run_demo", fake("demo", 0))
     monkeypatch.setattr("graderd.runtime.app.run_guard", fake("guard", 1))
     assert run_app(["run", "--config", "c.toml", "--rig-dir", "r", "--json"]) == 1
-    assert run_app(["demo"]) == 0
     assert run_app(["guard", "--config", "c.toml", "--json"]) == 1
     assert calls == [
         ("daemon", Path("c.toml"), False, Path("r"), True),
-        ("demo", False),
         ("guard", Path("c.toml")),
     ]
     assert json.loads(capsys.readouterr().out) == {"safe": False}

@@ -18,8 +18,8 @@ from typing import Any
 import pytest
 
 from graderd.core import commands as cmd
-from graderd.core.fault_catalogue import _by_key, find_rows
-from graderd.core.faults import (
+from graderd.core.faults.catalogue import _by_key, find_rows
+from graderd.core.faults.monitor import (
     ALL_AXES,
     ActiveFault,
     Clear,
@@ -35,7 +35,7 @@ from graderd.core.faults import (
 from graderd.core.gate import AXES, GateInputs, GateSettings, GateState, Setpoint, pass_gate
 from graderd.core.machine import Goals, MachineSettings, Mode, Pose, State, Step, Unmet, step
 from graderd.core.rule import RuleSettings
-from graderd.core.zones import SoilObservation, Zone
+from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.fault import DeviceFault
 from tests.unit.test_core_machine import EVENTS, NOW_S, STATES, do, fault
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from graderd.core import commands as cmd
-from graderd.core.faults import ALL_AXES, ActiveFault, Clear, FaultRow, Reaction
+from graderd.core.faults.monitor import ALL_AXES, ActiveFault, Clear, FaultRow, Reaction
 from graderd.core.machine import ARMED, Goals, Inputs, MachineSettings, Mode, Pose, State, Step, Unmet, step
 from graderd.core.rule import Decision, RuleSettings
-from graderd.core.zones import SoilObservation, Zone
+from graderd.core.soil import SoilObservation, Zone
 
 SETTINGS, RULE = MachineSettings(), RuleSettings()
 POSE = Pose(1.0, 100.0, 100.0, 50.0)

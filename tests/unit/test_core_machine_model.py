@@ -13,10 +13,10 @@ from itertools import product
 import pytest
 
 from graderd.core import commands as cmd
-from graderd.core.faults import ALL_AXES, ActiveFault, Clear, FaultRow, Reaction
+from graderd.core.faults.monitor import ALL_AXES, ActiveFault, Clear, FaultRow, Reaction
 from graderd.core.machine import ARMED, Goals, Inputs, Lease, MachineSettings, Mode, Pose, State, Step, Unmet, step
 from graderd.core.rule import Decision, RuleSettings
-from graderd.core.zones import SoilObservation, Zone
+from graderd.core.soil import SoilObservation, Zone
 
 TICK_S = 0.1
 SETTINGS = MachineSettings(arm_timeout_s=0.25, lease_s=0.15)

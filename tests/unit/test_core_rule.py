@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graderd.core.rule import Decision, RuleSettings, decide
-from graderd.core.zones import SoilObservation, Zone
+from graderd.core.soil import SoilObservation, Zone
 
 RULE = RuleSettings()
 SHARES = {

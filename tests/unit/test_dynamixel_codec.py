@@ -7,7 +7,7 @@ from dynamixel_sdk import Protocol2PacketHandler
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.dynamixel.codec import (
+from graderd.drivers.dynamixel.codec import (
     FastReply,
     Instruction,
     Packet,

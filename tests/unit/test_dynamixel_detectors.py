@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.dynamixel.arming import watchdog_counts
-from drivers.dynamixel.calibration import Calibration
-from drivers.dynamixel.detectors import MotionDetectors, Sample
-from drivers.dynamixel.faultbook import FaultBook
-from drivers.dynamixel.table import ControlTable
-from drivers.dynamixel.virtual.motion import Profile, Trajectory
+from graderd.drivers.dynamixel.arming import watchdog_counts
+from graderd.drivers.dynamixel.calibration import Calibration
+from graderd.drivers.dynamixel.faultbook import FaultBook
+from graderd.drivers.dynamixel.motion_faults import MotionDetectors, Sample
+from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.settings import RotatorSettings
+from graderd.simulator.servo.motion import Profile, Trajectory
 
 TABLE = ControlTable.load("ph54_200_s500")
 SETTINGS = RotatorSettings()

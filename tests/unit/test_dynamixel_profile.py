@@ -10,8 +10,8 @@ from itertools import pairwise
 import jsonschema
 import pytest
 
-import firmware_profiles
-from drivers.dynamixel.table import ControlTable
+from graderd import firmware_profiles
+from graderd.drivers.dynamixel.table import ControlTable
 
 TABLES = [n for n in firmware_profiles.names() if firmware_profiles.load(n).get("kind") == "control_table"]
 

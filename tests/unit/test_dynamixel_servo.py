@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.dynamixel.codec import (
+from graderd.drivers.dynamixel.codec import (
     BROADCAST_ID,
     Instruction,
     StatusError,
     split_fast_status,
 )
-from drivers.dynamixel.virtual import VirtualServo
+from graderd.simulator.servo import VirtualServo
 from tests.servo_line import Line, moving
 
 

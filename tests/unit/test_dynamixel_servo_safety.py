@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.dynamixel.codec import (
+from graderd.drivers.dynamixel.codec import (
     BROADCAST_ID,
     Instruction,
     StatusError,
 )
-from drivers.dynamixel.virtual import VirtualServo
+from graderd.simulator.servo import VirtualServo
 from tests.servo_line import Line, moving
 
 KEY = bytes((0x43, 0x54, 0x52, 0x4C))

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import firmware_profiles
-from drivers.electrak.codec import Control, ElectrakCodec, Feedback, load_database
-from drivers.electrak.profile import load_profile
+from graderd import firmware_profiles
+from graderd.drivers.electrak.codec import Control, ElectrakCodec, Feedback, load_database
+from graderd.drivers.electrak.profile import load_profile
 from graderd.hal.errors import WrongDeviceError
 
 PROFILES = [name for name in firmware_profiles.names() if name.startswith("electrak_")]

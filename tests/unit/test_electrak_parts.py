@@ -8,13 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.electrak.bus_events import BusEvent
-from drivers.electrak.bus_health import BusHealth
-from drivers.electrak.overload import OverloadPolicy, Verdict
-from drivers.electrak.planner import Motion, MotionPlanner, Phase
-from drivers.electrak.profile import load_profile
-from drivers.electrak.thermal import DERATE_FROM, ThermalGuard
-from drivers.electrak.ticker import Ticker
+from graderd.drivers.electrak.planner import Motion, MotionPlanner, Phase
+from graderd.drivers.electrak.profile import load_profile
+from graderd.drivers.electrak.thermal import DERATE_FROM, OverloadPolicy, ThermalGuard, Verdict
+from graderd.drivers.j1939.bus_health import BusEvent, BusHealth
+from graderd.drivers.j1939.ticker import Ticker
 from graderd.hal.errors import DeviceMissingError
 
 HD = load_profile("electrak_hd_b017").figures

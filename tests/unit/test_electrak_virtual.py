@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.electrak.codec import Control, ElectrakCodec, Feedback
-from drivers.electrak.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
-from drivers.electrak.j1939.name import Name
-from drivers.electrak.virtual import VirtualElectrak
+from graderd.drivers.electrak.codec import Control, ElectrakCodec, Feedback
+from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
+from graderd.drivers.j1939.name import Name
+from graderd.simulator.actuators import VirtualElectrak
 
 CODEC = ElectrakCodec("electrak_hd")
 

@@ -9,8 +9,8 @@ import pytest
 
 from graderd.cli.app import run_app
 from graderd.cli.docs import pages
-from graderd.core.fault_catalogue import CATALOGUE, find_rows
-from graderd.core.faults import (
+from graderd.core.faults.catalogue import CATALOGUE, find_rows
+from graderd.core.faults.monitor import (
     ACTUATORS,
     ALL_AXES,
     Clear,

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.electrak.j1939.claim import SELF_CONFIGURABLE, VETO_S, AddressClaimer, ClaimState
-from drivers.electrak.j1939.ids import NULL, Frame, Pgn, pgn_of, source_of
-from drivers.electrak.j1939.name import Name
+from graderd.drivers.j1939.claim import SELF_CONFIGURABLE, VETO_S, AddressClaimer, ClaimState
+from graderd.drivers.j1939.ids import NULL, Frame, Pgn, pgn_of, source_of
+from graderd.drivers.j1939.name import Name
 
 OURS = Name(identity=5, industry_group=3, function=132, arbitrary_address_capable=1)
 LOWER, HIGHER = OURS.value - 1, OURS.value + 1

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.electrak.j1939.ids import (
+from graderd.drivers.j1939.ids import (
     GLOBAL,
     Pgn,
     destination_of,
@@ -18,7 +18,7 @@ from drivers.electrak.j1939.ids import (
     priority_of,
     source_of,
 )
-from drivers.electrak.j1939.name import Name
+from graderd.drivers.j1939.name import Name
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from drivers.electrak.j1939 import dm1
-from drivers.electrak.j1939.ids import GLOBAL, NULL, Frame, Pgn, make_id, pgn_of
-from drivers.electrak.j1939.name import Name
-from drivers.electrak.j1939.node import Identity, J1939Node
-from drivers.electrak.j1939.transport import Control
+from graderd.drivers.j1939 import dm1
+from graderd.drivers.j1939.ids import GLOBAL, NULL, Frame, Pgn, make_id, pgn_of
+from graderd.drivers.j1939.name import Name
+from graderd.drivers.j1939.node import Identity, J1939Node
+from graderd.drivers.j1939.transport import Control
 
 OURS = Name(identity=1, industry_group=3, function=132, arbitrary_address_capable=1)
 

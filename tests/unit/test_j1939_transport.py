@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.electrak.j1939.ids import GLOBAL, Frame, Pgn, destination_of, make_id, pgn_of, source_of
-from drivers.electrak.j1939.transport import BAM_GAP_S, MAX_SESSIONS_N, Abort, Control, Message, Transport
+from graderd.drivers.j1939.ids import GLOBAL, Frame, Pgn, destination_of, make_id, pgn_of, source_of
+from graderd.drivers.j1939.transport import BAM_GAP_S, MAX_SESSIONS_N, Abort, Control, Message, Transport
 
 
 def node(address: int) -> Transport:

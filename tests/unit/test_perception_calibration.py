@@ -8,16 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.rig.blade import BladePose
-from drivers.rig.ground import SceneState
-from drivers.rig.look import Look
-from drivers.rig.optics import knocked
-from drivers.rig.renderer import Renderer
-from drivers.rig.soil import SoilField
 from graderd.core.blade import BladeGeometry
-from graderd.core.zones import Zone
+from graderd.core.soil import Zone
 from graderd.hal.camera import Frame
 from graderd.perception import CameraCalibration
+from graderd.perception.annotate import calibration_picture
 from graderd.perception.calibration import (
     GEOMETRY,
     POSE,
@@ -27,8 +22,13 @@ from graderd.perception.calibration import (
     calibrate,
     with_pose,
 )
-from graderd.perception.calibration_picture import calibration_picture
 from graderd.perception.settings import StreamCalibration
+from graderd.simulator.camera.appearance import Appearance
+from graderd.simulator.camera.ground import SceneState
+from graderd.simulator.camera.optics import knocked
+from graderd.simulator.camera.renderer import Renderer
+from graderd.simulator.grader.blade import BladePose
+from graderd.simulator.grader.soil import SoilField
 from tests.perception_scenes import Scene, render
 
 NOMINAL = CameraCalibration()
@@ -101,7 +101,7 @@ def rig_view(angle_deg: float) -> EmptyBlade:
     renderer = Renderer((1280, 800), None, seed=5, color_pose=color_pose, depth_pose=depth_pose)
     field = SoilField()
     state = SceneState(field.heights_m.astype(np.float32), field.cell_m, 2.0, BladePose(angle_deg))
-    picture, _ = renderer.render(state, Look(ground="earth"))
+    picture, _ = renderer.render(state, Appearance(ground="earth"))
     return EmptyBlade(Frame(picture, None, renderer.color_intrinsics, None, 0.0), angle_deg)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graderd.core.zones import Zone
+from graderd.core.soil import Zone
 from graderd.perception import CameraCalibration, PerceptionSettings
 from graderd.perception.color import (
     brightness_gain,

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graderd.core.zones import Zone
+from graderd.core.soil import Zone
 from graderd.perception.decide import decide
 from graderd.perception.settings import DecisionSettings
 

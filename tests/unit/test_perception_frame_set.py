@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from graderd.core.blade import BladeGeometry
-from graderd.core.zones import Zone
+from graderd.core.soil import Zone
 from graderd.hal.camera import EndOfFrames, Frame
 from graderd.hal.errors import DeviceError, LifecycleError
 from graderd.hal.settings import CameraSettings

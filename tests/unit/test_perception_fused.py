@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from graderd.core.zones import Zone
-from graderd.perception.decide import Verdict
-from graderd.perception.fused import fuse
+from graderd.core.soil import Zone
+from graderd.perception.decide import Verdict, fuse
 
 
 def says(zone: Zone, confidence: float = 0.9) -> Verdict:

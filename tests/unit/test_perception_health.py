@@ -10,18 +10,18 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.rig.blade import BladePose
-from drivers.rig.ground import SceneState
-from drivers.rig.look import Look
-from drivers.rig.piles import SceneZone
-from drivers.rig.renderer import Renderer
-from drivers.rig.world import World, scene_heights
 from graderd.core.blade import BladeGeometry
-from graderd.core.zones import SoilObservation, Zone
+from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.camera import Frame
 from graderd.hal.settings import CameraSettings
 from graderd.perception import METHODS, CameraCalibration, Method, PerceptionSettings
 from graderd.perception.classifier import Classifier, make_classifier
+from graderd.simulator.camera.appearance import Appearance
+from graderd.simulator.camera.ground import SceneState
+from graderd.simulator.camera.renderer import Renderer
+from graderd.simulator.grader.blade import BladePose
+from graderd.simulator.grader.piles import SceneZone
+from graderd.simulator.grader.world import World, scene_heights
 from tests.perception_scenes import PoseError, Scene, render
 
 ANGLE_DEG = 10.0
@@ -186,7 +186,7 @@ def test_soil_heaped_against_the_face_is_not_taken_for_the_face() -> None:
     assert left_l > 1.7 * right_l
     renderer = Renderer((640, 400), (424, 240), seed=3)
     seen = SceneState(world.field.heights_m.astype(np.float32), world.field.cell_m, world.vehicle.x_m, pose)
-    color, depth = renderer.render(seen, Look())
+    color, depth = renderer.render(seen, Appearance())
     frame = Frame(color, depth, renderer.color_intrinsics, renderer.depth_intrinsics, 0.0)
     classifier = make_classifier(PerceptionSettings(), CameraCalibration(), BladeGeometry(), live=False)
     observation = classifier.classify(frame, angle_deg, 0.01)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.realsense import FolderCamera, VideoCamera
+from graderd.drivers.realsense import FolderCamera, VideoCamera
 from graderd.hal.camera import EndOfFrames
 from graderd.hal.errors import DeviceMissingError, LifecycleError, ProtocolError
 from graderd.hal.settings import CameraSettings

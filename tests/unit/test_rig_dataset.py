@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.rig import dataset
-from drivers.rig.blade import volumes_in_front_m3
-from drivers.rig.ground import SceneState
-from drivers.rig.materials import Materials
-from drivers.rig.optics import COLOR_POSE, DEPTH_INTRINSICS, knocked
-from drivers.rig.renderer import Renderer
-from drivers.rig.scenes import label_of, random_scene
 from graderd.perception.frame_set import FrameSet
+from graderd.simulator import dataset
+from graderd.simulator.camera.ground import SceneState
+from graderd.simulator.camera.materials import Materials
+from graderd.simulator.camera.optics import COLOR_POSE, DEPTH_INTRINSICS, knocked
+from graderd.simulator.camera.renderer import Renderer
+from graderd.simulator.grader.blade import volumes_in_front_m3
+from graderd.simulator.scenes import label_of, random_scene
 
 SCENES = 6
 
@@ -102,18 +102,18 @@ def test_rig_scenes_vary_and_repeat() -> None:
     scenes = [random_scene(3, number) for number in range(60)]
     again = random_scene(3, 17)
     assert np.array_equal(again.field.heights_m, scenes[17].field.heights_m)
-    assert again.look == scenes[17].look
+    assert again.appearance == scenes[17].appearance
     assert again.props == scenes[17].props
     assert not np.array_equal(random_scene(4, 17).field.heights_m, scenes[17].field.heights_m)
     labels = Counter(scene.label for scene in scenes)
     assert set(labels) == {"left", "center", "right", "even", "none"}
     assert min(labels.values()) >= 6
     assert sum(scene.ambiguous for scene in scenes) < 0.25 * len(scenes)
-    assert len({scene.look.soil for scene in scenes}) == 6
-    assert len({scene.look.blade for scene in scenes}) == 3
-    assert len({scene.look.ground for scene in scenes}) == 3
-    assert sum(scene.look.red_cast > 0.08 for scene in scenes) > 10
-    assert sum(scene.look.machine_shadow > 0 for scene in scenes) > 8
+    assert len({scene.appearance.soil for scene in scenes}) == 6
+    assert len({scene.appearance.blade for scene in scenes}) == 3
+    assert len({scene.appearance.ground for scene in scenes}) == 3
+    assert sum(scene.appearance.red_cast > 0.08 for scene in scenes) > 10
+    assert sum(scene.appearance.machine_shadow > 0 for scene in scenes) > 8
     angles = [scene.blade.angle_deg for scene in scenes]
     assert min(angles) < -45
     assert max(angles) > 45
@@ -130,7 +130,7 @@ def test_rig_set_depth_shows_the_volumes_it_is_labelled_with() -> None:
         color_pose, depth_pose = knocked(scene.shift_m, scene.turn_deg)
         renderer = Renderer((320, 200), (848, 480), color_pose=color_pose, depth_pose=depth_pose, materials=materials)
         state = SceneState(scene.field.heights_m.astype(np.float32), scene.field.cell_m, scene.vehicle_x_m, scene.blade)
-        depth = renderer.render_depth_m(state, scene.look)
+        depth = renderer.render_depth_m(state, scene.appearance)
         v, u = np.mgrid[0:480, 0:848].astype(np.float64)
         lens = DEPTH_INTRINSICS
         rays = np.stack(((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, np.ones_like(u)), axis=-1)
@@ -162,7 +162,7 @@ def test_rig_set_is_not_overwritten_and_bad_arguments_are_refused(
     blocker.write_text("")
     assert dataset.main(["--out", str(blocker / "set"), "--scenes", "1", "--quiet"]) == 1
     result = subprocess.run(
-        [sys.executable, "-m", "drivers.rig.dataset", "--out", str(tmp_path / "x"), "--scenes", "0"],
+        [sys.executable, "-m", "graderd.simulator.dataset", "--out", str(tmp_path / "x"), "--scenes", "0"],
         capture_output=True,
         text=True,
         timeout=60,

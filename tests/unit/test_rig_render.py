@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from drivers.rig.blade import BladePose, Plough
-from drivers.rig.ground import SceneState
-from drivers.rig.look import Look
-from drivers.rig.materials import Materials
-from drivers.rig.optics import (
+from graderd.hal.camera import Intrinsics, StreamPose
+from graderd.simulator.camera.appearance import Appearance
+from graderd.simulator.camera.ground import SceneState
+from graderd.simulator.camera.materials import Materials
+from graderd.simulator.camera.optics import (
     COLOR_INTRINSICS,
     COLOR_POSE,
     DEPTH_INTRINSICS,
@@ -22,12 +22,12 @@ from drivers.rig.optics import (
     camera_json,
     knocked,
 )
-from drivers.rig.piles import SceneZone, lay_scene
-from drivers.rig.renderer import Renderer
-from drivers.rig.shapes import Solid
-from drivers.rig.soil import SoilField
-from drivers.rig.surface import Rays, SurfaceSweep
-from graderd.hal.camera import Intrinsics, StreamPose
+from graderd.simulator.camera.renderer import Renderer
+from graderd.simulator.camera.shapes import Solid
+from graderd.simulator.camera.surface import Rays, SurfaceSweep
+from graderd.simulator.grader.blade import BladePose, Plough
+from graderd.simulator.grader.piles import SceneZone, lay_scene
+from graderd.simulator.grader.soil import SoilField
 
 COLOR_SIZE, DEPTH_SIZE = (320, 200), (424, 240)
 
@@ -86,7 +86,7 @@ def test_rig_depth_of_bare_floor_and_blade(materials: Materials) -> None:
     lens = renderer.depth_intrinsics
     assert lens is not None
     points = points_m(
-        renderer.render_depth_m(state_of(SoilField(), 3.0, BladePose(angle_deg)), Look()), lens, DEPTH_POSE
+        renderer.render_depth_m(state_of(SoilField(), 3.0, BladePose(angle_deg)), Appearance()), lens, DEPTH_POSE
     )
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     angle = math.radians(angle_deg)
@@ -110,13 +110,13 @@ def test_rig_the_operators_left_is_on_image_right(materials: Materials, zone: Sc
     lay_scene(field, zone, 3.0, BladePose())
     bare, heaped = SoilField(), field
     renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, materials=materials)
-    depth = {name: renderer.render_depth_m(state_of(f), Look()) for name, f in (("bare", bare), ("heap", heaped))}
+    depth = {name: renderer.render_depth_m(state_of(f), Appearance()) for name, f in (("bare", bare), ("heap", heaped))}
     nearer = (depth["bare"] - depth["heap"]) > 0.02
     columns = np.nonzero(nearer)[1] - DEPTH_SIZE[0] / 2
     assert nearer.mean() > 0.03
     assert columns.mean() * side > 60
-    color, _ = Renderer(COLOR_SIZE, None, materials=materials).render(state_of(heaped), Look(color_noise=0.0))
-    empty, _ = Renderer(COLOR_SIZE, None, materials=materials).render(state_of(bare), Look(color_noise=0.0))
+    color, _ = Renderer(COLOR_SIZE, None, materials=materials).render(state_of(heaped), Appearance(color_noise=0.0))
+    empty, _ = Renderer(COLOR_SIZE, None, materials=materials).render(state_of(bare), Appearance(color_noise=0.0))
     changed = np.abs(color.astype(int) - empty).max(axis=2) > 40
     assert (np.nonzero(changed)[1].mean() - COLOR_SIZE[0] / 2) * side > 40
 
@@ -125,7 +125,9 @@ def test_rig_counter_clockwise_takes_the_left_end_back(materials: Materials) -> 
     renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, materials=materials)
     lens = renderer.depth_intrinsics
     assert lens is not None
-    points = points_m(renderer.render_depth_m(state_of(SoilField(), 3.0, BladePose(30.0)), Look()), lens, DEPTH_POSE)
+    points = points_m(
+        renderer.render_depth_m(state_of(SoilField(), 3.0, BladePose(30.0)), Appearance()), lens, DEPTH_POSE
+    )
     on_blade = (points[..., 2] > 0.05) & (points[..., 2] < 0.2) & (np.abs(points[..., 1]) < 0.5)
     left = on_blade & (points[..., 1] > 0.3) & (points[..., 0] > -0.6)
     right = on_blade & (points[..., 1] < -0.3)
@@ -139,8 +141,8 @@ def test_rig_measured_depth_has_the_noise_holes_and_limits_of_the_camera(materia
     lay_scene(field, SceneZone.CENTER, 3.0, BladePose())
     Plough(field).settle(3.0, BladePose())
     state = state_of(field)
-    true_mm = renderer.render_depth_m(state, Look()) * 1000.0
-    frames = [renderer.render(state, Look())[1] for _ in range(6)]
+    true_mm = renderer.render_depth_m(state, Appearance()) * 1000.0
+    frames = [renderer.render(state, Appearance())[1] for _ in range(6)]
     stack = np.stack([frame for frame in frames if frame is not None]).astype(np.float64)
     assert frames[0] is not None
     assert frames[0].dtype == np.uint16
@@ -161,8 +163,8 @@ def test_rig_depth_is_lost_at_edges(materials: Materials) -> None:
     renderer = Renderer(COLOR_SIZE, (848, 480), materials=materials)
     wall = Solid("box", (0.30, 0.0, 0.15), (0.01, 0.05, 0.15), (80, 80, 80))
     state = state_of(SoilField(), 3.0, BladePose(), wall)
-    true_m = renderer.render_depth_m(state, Look())
-    _, depth = renderer.render(state, Look(hole_share=0.0))
+    true_m = renderer.render_depth_m(state, Appearance())
+    _, depth = renderer.render(state, Appearance(hole_share=0.0))
     assert depth is not None
     jump = np.abs(np.diff(true_m, axis=1)) > 0.15
     jump &= (true_m[:, 1:] < MAX_DEPTH_M) & (true_m[:, :-1] < MAX_DEPTH_M)
@@ -178,7 +180,7 @@ def test_rig_pictures_repeat_by_seed(materials: Materials) -> None:
         renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, seed=seed)
         pictures: list[npt.NDArray[np.uint8]] = []
         for _ in range(2):
-            color, depth = renderer.render(state_of(field), Look())
+            color, depth = renderer.render(state_of(field), Appearance())
             assert depth is not None
             pictures += [color, depth.view(np.uint8)]
         return pictures
@@ -192,23 +194,23 @@ def test_rig_color_is_a_whole_picture_under_any_look(materials: Materials) -> No
     field = SoilField()
     lay_scene(field, SceneZone.EVEN, 3.0, BladePose())
     renderer = Renderer(COLOR_SIZE, None, materials=materials)
-    plain, depth = renderer.render(state_of(field), Look())
+    plain, depth = renderer.render(state_of(field), Appearance())
     assert depth is None
     assert plain.shape == (200, 320, 3)
     assert plain.dtype == np.uint8
     looks = {
-        "dark": Look(exposure=0.3),
-        "red": Look(red_cast=0.3),
-        "wet": Look(wetness=1.0),
-        "sand": Look(soil="sand"),
-        "rusty": Look(blade="rusty"),
-        "painted": Look(blade="painted"),
-        "concrete": Look(ground="concrete"),
-        "low sun": Look(sun_azimuth_deg=-90.0, sun_elevation_deg=10.0),
-        "shadow": Look(machine_shadow=0.7),
-        "night": Look(sun_strength=0.0, ambient=0.1),
+        "dark": Appearance(exposure=0.3),
+        "red": Appearance(red_cast=0.3),
+        "wet": Appearance(wetness=1.0),
+        "sand": Appearance(soil="sand"),
+        "rusty": Appearance(blade="rusty"),
+        "painted": Appearance(blade="painted"),
+        "concrete": Appearance(ground="concrete"),
+        "low sun": Appearance(sun_azimuth_deg=-90.0, sun_elevation_deg=10.0),
+        "shadow": Appearance(machine_shadow=0.7),
+        "night": Appearance(sun_strength=0.0, ambient=0.1),
     }
-    pictures = {name: renderer.render(state_of(field), look)[0] for name, look in looks.items()}
+    pictures = {name: renderer.render(state_of(field), appearance)[0] for name, appearance in looks.items()}
     for name, picture in pictures.items():
         assert np.abs(picture.astype(int) - plain).mean() > 1.0, name
     assert pictures["dark"].mean() < 0.5 * plain.mean()
@@ -224,7 +226,7 @@ def test_rig_soil_texture_stays_on_the_ground(materials: Materials) -> None:
     field = SoilField()
     field.heights_m += 0.05
     renderer = Renderer((640, 400), None, materials=materials)
-    still = Look(color_noise=0.0, shadows=False, ambient=0.8, sun_strength=0.4)
+    still = Appearance(color_noise=0.0, shadows=False, ambient=0.8, sun_strength=0.4)
     near, far = (renderer.render(state_of(field, x_m), still)[0].astype(np.float32).mean(axis=2) for x_m in (3.0, 3.1))
     rays = Rays.of(COLOR_INTRINSICS.scaled(640, 400), COLOR_POSE)
     depth = (COLOR_POSE.position_m[2] - 0.05) / -rays.dz
@@ -250,11 +252,11 @@ def test_rig_pictures_of_any_bed_are_whole(materials: Materials, height_m: float
     renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, materials=materials)
     for x_m, angle_deg, lift_m in ((0.0, 90.0, 0.0), (0.8, -60.0, 0.195), (7.0, 45.0, -0.1), (8.0, 180.0, 0.0)):
         state = state_of(field, x_m, BladePose(angle_deg, lift_m, 5.0, 15.0))
-        color, depth = renderer.render(state, Look())
+        color, depth = renderer.render(state, Appearance())
         assert color.shape == (200, 320, 3)
         assert depth is not None
         assert depth.shape == (240, 424)
-        assert np.isfinite(renderer.render_depth_m(state, Look())).all()
+        assert np.isfinite(renderer.render_depth_m(state, Appearance())).all()
 
 
 def test_rig_a_knock_moves_the_picture(materials: Materials) -> None:
@@ -262,7 +264,7 @@ def test_rig_a_knock_moves_the_picture(materials: Materials) -> None:
     straight = Renderer(COLOR_SIZE, DEPTH_SIZE, materials=materials)
     bent = Renderer(COLOR_SIZE, DEPTH_SIZE, color_pose=color_pose, depth_pose=depth_pose, materials=materials)
     state = state_of(SoilField())
-    assert np.abs(straight.render_depth_m(state, Look()) - bent.render_depth_m(state, Look())).mean() > 0.02
+    assert np.abs(straight.render_depth_m(state, Appearance()) - bent.render_depth_m(state, Appearance())).mean() > 0.02
     rotation = np.array(color_pose.rotation)
     assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     offset = np.array(depth_pose.position_m) - np.array(color_pose.position_m)

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.rig.blade import FACE_HEIGHT_M, BladePose, Plough, volumes_in_front_m3
-from drivers.rig.load import blade_load
-from drivers.rig.piles import SceneZone, heap, lay_scene, layer
-from drivers.rig.soil import REPOSE_DEG, SoilField
+from graderd.simulator.grader.blade import FACE_HEIGHT_M, BladePose, Plough, volumes_in_front_m3
+from graderd.simulator.grader.load import blade_load
+from graderd.simulator.grader.piles import SceneZone, heap, lay_scene, layer
+from graderd.simulator.grader.soil import REPOSE_DEG, SoilField
 
 X_M = 3.0
 

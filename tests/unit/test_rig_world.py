@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.rig.blade import BladePose
-from drivers.rig.load import blade_load
-from drivers.rig.look import Look
-from drivers.rig.piles import SceneZone
-from drivers.rig.shared import SharedScene
-from drivers.rig.topview import CAMERA_HEIGHT_M, top_depth, top_view
-from drivers.rig.world import MAX_X_M, MIN_X_M, START_X_M, Vehicle, World, scene_heights
+from graderd.simulator.camera.appearance import Appearance
+from graderd.simulator.camera.renderer import CAMERA_HEIGHT_M, top_depth, top_view
+from graderd.simulator.camera.shared_scene import SharedScene
+from graderd.simulator.grader.blade import BladePose
+from graderd.simulator.grader.load import blade_load
+from graderd.simulator.grader.piles import SceneZone
+from graderd.simulator.grader.world import MAX_X_M, MIN_X_M, START_X_M, Vehicle, World, scene_heights
 
 
 def driven(vehicle: Vehicle, step_s: float = 0.01, limit_s: float = 60.0) -> tuple[float, float]:
@@ -104,7 +104,7 @@ def test_rig_top_view_is_seen_from_above_with_forward_up_and_left_left() -> None
     assert columns.max() < 20
     assert depth.min() == round((CAMERA_HEIGHT_M - 0.2) * 1000)
     assert depth.max() == round(CAMERA_HEIGHT_M * 1000)
-    view = top_view(heights_m, 0.02, 4.0, BladePose(30.0), Look())
+    view = top_view(heights_m, 0.02, 4.0, BladePose(30.0), Appearance())
     assert view.shape == (1600, 400, 3)
     yellow = (view[..., 2] > 240) & (view[..., 1] > 180) & (view[..., 0] < 90)
     rows, columns = np.nonzero(yellow)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.dynamixel.ph54 import Ph54Rotator
+from graderd.drivers.dynamixel.ph54 import Ph54Rotator
 from graderd.hal.settings import RotatorSettings
 from graderd.runtime.app import adapter_watch
 

@@ -12,7 +12,7 @@ import pytest
 from graderd.config import Config
 from graderd.core import commands as cmd
 from graderd.core.machine import Mode
-from graderd.core.zones import SoilObservation, Zone
+from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.errors import DeviceRefusedError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle

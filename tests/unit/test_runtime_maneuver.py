@@ -17,15 +17,15 @@ from graderd.hal.lifecycle import Lifecycle
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.maneuver import Maneuver
 from graderd.runtime.state_file import StateFile
+from tests.awake_clock import AwakeClock
 from tests.fakes import FakeMachine
-from tests.patience import PatientClock
 
 
 @asynccontextmanager
 async def running(tmp_path: Path) -> AsyncIterator[tuple[FakeMachine, ControlLoop]]:
     """A control loop ticking in real time over fake devices."""
     machine = FakeMachine()
-    clock = PatientClock()
+    clock = AwakeClock()
     for device in (machine.rotation, machine.lift_left, machine.lift_right, machine.tilt):
         device.clock = clock  # type: ignore[assignment]  # the fakes only read it
     loop = ControlLoop(Config(), machine.devices, machine.eyes, clock, StateFile(str(tmp_path)))

@@ -12,7 +12,7 @@ import pytest
 from graderd.config import Config, parse
 from graderd.core.machine import Mode
 from graderd.core.status import Status
-from graderd.runtime.app.worker import AngleHistory, settings_not_kept
+from graderd.runtime.app.perception_child import AngleHistory, settings_not_kept
 from graderd.runtime.health import HealthWatch
 from graderd.runtime.recorder import Recorder
 from graderd.runtime.sd_notify import SystemdNotifier

@@ -16,16 +16,17 @@ import gpiod
 import pytest
 from pydantic import ValidationError
 
-from drivers.stop_input import GpioStopInput, SerialStopInput, SimulatedStopInput, StopLoop, make_stop_input
 from graderd.config import Config
-from graderd.core.fault_catalogue import CATALOGUE
-from graderd.core.faults import Clear, Reaction
+from graderd.core.faults.catalogue import CATALOGUE
+from graderd.core.faults.monitor import Clear, Reaction
+from graderd.drivers.stop_input import GpioStopInput, SerialStopInput, SimulatedStopInput, make_stop_input
 from graderd.hal.clock import ManualClock, SystemClock
 from graderd.hal.errors import DeviceLostError, DeviceMissingError
 from graderd.hal.settings import StopInputSettings
 from graderd.hal.stop_input import StopInput
 from graderd.runtime.stop_input import FIRST_WORD_S, StopInputWatch
-from tests.patience import PatientClock
+from graderd.simulator.stop_loop import StopLoop
+from tests.awake_clock import AwakeClock
 
 DEADLINE_S = 5.0
 
@@ -254,7 +255,7 @@ class Watching:
     """A watch over the simulated loop, and what it told."""
 
     def __init__(
-        self, watch: StopInputWatch, loop: StopLoop, stops: list[tuple[float, str]], clock: PatientClock
+        self, watch: StopInputWatch, loop: StopLoop, stops: list[tuple[float, str]], clock: AwakeClock
     ) -> None:
         self.watch = watch
         self.loop = loop
@@ -279,7 +280,7 @@ async def watching(tmp_path: Path, source: StopInput | None = None, **settings: 
     loop = StopLoop(tmp_path / "stop.sock")
     await loop.start()
     stops: list[tuple[float, str]] = []
-    clock = PatientClock()
+    clock = AwakeClock()
     watch = StopInputWatch(
         StopInputSettings(backend="simulated", **settings),
         source or SimulatedStopInput(str(loop.path)),

@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 import serial
 
-from drivers.dynamixel import ports
-from drivers.dynamixel.bus import ServoBus, ServoRefusedError
-from drivers.dynamixel.codec import Instruction, StatusError, StreamDecoder, encode, encode_status
-from drivers.dynamixel.table import ControlTable
-from drivers.dynamixel.virtual import VirtualServo, VirtualServoBus
+from graderd.drivers.dynamixel import serial_port
+from graderd.drivers.dynamixel.bus import ServoBus, ServoRefusedError
+from graderd.drivers.dynamixel.codec import Instruction, StatusError, StreamDecoder, encode, encode_status
+from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.errors import DeviceLostError, DeviceMissingError, DeviceTimeoutError
+from graderd.simulator.servo import VirtualServo, VirtualServoBus
 
 TABLE = ControlTable.load("ph54_200_s500")
 GOAL = TABLE["goal_position"]
@@ -256,7 +256,7 @@ async def test_low_latency_is_asked_for_and_its_absence_reported(
     assert bus.counters()["low_latency_n"] == 1
     bus.close()
     monkeypatch.undo()
-    monkeypatch.setattr(ports, "latency_timer_ms", lambda _: 16)
+    monkeypatch.setattr(serial_port, "latency_timer_ms", lambda _: 16)
     bus.open()
     assert bus.counters()["low_latency_n"] == 0
     assert "16 ms" in caplog.text
@@ -266,17 +266,17 @@ async def test_low_latency_is_asked_for_and_its_absence_reported(
 def test_the_latency_timer_is_read_where_there_is_one(tmp_path: Path) -> None:
     (tmp_path / "ttyUSB0").mkdir()
     (tmp_path / "ttyUSB0" / "latency_timer").write_text("16\n", encoding="ascii")
-    assert ports.latency_timer_ms("/dev/ttyUSB0", tmp_path) == 16
-    assert ports.latency_timer_ms("/dev/ttyUSB1", tmp_path) is None
+    assert serial_port.latency_timer_ms("/dev/ttyUSB0", tmp_path) == 16
+    assert serial_port.latency_timer_ms("/dev/ttyUSB1", tmp_path) is None
 
 
 def test_a_port_that_is_no_port(tmp_path: Path) -> None:
     with pytest.raises(DeviceMissingError, match="no such serial port"):
-        ports.open_port(str(tmp_path / "none"), 57_600)
+        serial_port.open_port(str(tmp_path / "none"), 57_600)
     file = tmp_path / "file"
     file.write_text("x", encoding="ascii")
     with pytest.raises(DeviceMissingError, match="cannot be opened"):
-        ports.open_port(str(file), 57_600)
+        serial_port.open_port(str(file), 57_600)
 
 
 class Slave:

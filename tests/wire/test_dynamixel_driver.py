@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from drivers.dynamixel import Ph54Rotator, ServoBus
-from drivers.dynamixel.codec import Instruction, Packet, StatusError, StreamDecoder
-from drivers.dynamixel.device import Ph54Device
-from drivers.dynamixel.table import ControlTable
-from drivers.dynamixel.virtual import VirtualServo, VirtualServoBus
+from graderd.drivers.dynamixel import Ph54Rotator, ServoBus
+from graderd.drivers.dynamixel.codec import Instruction, Packet, StatusError, StreamDecoder
+from graderd.drivers.dynamixel.device import Ph54Device
+from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.errors import DeviceError, DeviceTimeoutError, LifecycleError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import RotatorSettings
+from graderd.simulator.servo import VirtualServo, VirtualServoBus
+from tests.awake_clock import AwakeClock
 from tests.dynamixel_sim import bench, until
-from tests.patience import PatientClock
 
 TABLE = ControlTable.load("ph54_200_s500")
 PROFILE = TABLE["profile_acceleration"].address
@@ -44,7 +44,7 @@ class Tap:
 
 
 async def tapped(tmp_path: Path, servo: VirtualServo, **changes: float) -> tuple[Tap, Ph54Rotator, VirtualServoBus]:
-    clock = PatientClock()
+    clock = AwakeClock()
     wire = VirtualServoBus([servo], tmp_path / "servo", clock=clock)
     await wire.start()
     tap = Tap()

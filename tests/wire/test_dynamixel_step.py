@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.dynamixel.step import StepSample, analyse, step_response
-from drivers.dynamixel.step_report import render
+from graderd.drivers.dynamixel.step import StepSample, analyse, render, step_response
 from graderd.hal.errors import CommandRangeError, LifecycleError
 from tests.dynamixel_sim import bench
 

@@ -18,16 +18,16 @@ import cantools.database
 import j1939
 import pytest
 
-import firmware_profiles
-from drivers.electrak import CanLink, ElectrakActuator, safe_off
-from drivers.electrak.j1939.ids import Pgn
-from drivers.electrak.j1939.transport import Message
-from drivers.electrak.virtual import VirtualActuatorBus, VirtualElectrak
+import graderd.firmware_profiles
+from graderd.drivers.electrak import CanLink, ElectrakActuator, safe_off
+from graderd.drivers.j1939.ids import Pgn
+from graderd.drivers.j1939.transport import Message
 from graderd.hal.errors import DeviceMissingError
 from graderd.hal.settings import ActuatorSettings, CanSettings
+from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from tests.electrak_sim import until
 
-DBC = Path(next(iter(firmware_profiles.__path__))) / "electrak_hd.dbc"
+DBC = Path(next(iter(graderd.firmware_profiles.__path__))) / "electrak_hd.dbc"
 
 
 @pytest.fixture
@@ -171,7 +171,7 @@ async def read_line(stream: asyncio.StreamReader) -> dict[str, Any]:
 @pytest.mark.serial_only
 async def test_the_virtual_actuators_run_alone_and_take_faults_on_standard_input(tmp_path: Path) -> None:
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "drivers.electrak.virtual", "--link", str(tmp_path / "can"),
+        sys.executable, "-m", "graderd.simulator.actuators", "--link", str(tmp_path / "can"),
         stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
     )  # fmt: skip
     try:

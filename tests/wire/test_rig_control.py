@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.rig.control import RigControl, rig_request
-from drivers.rig.server import Rig
 from graderd.hal.errors import DeviceLostError, DeviceMissingError, DeviceRefusedError
+from graderd.simulator.control_client import RigControl, rig_request
+from graderd.simulator.process import Rig
 from tests.electrak_sim import until
 
 READY_S = 30.0

@@ -1,4 +1,4 @@
-"""The wiring: daemon, perception child, guard and demonstration. The only package that imports drivers.
+"""The wiring: daemon, perception child and guard. The only package that imports drivers.
 
 The functions import what they need when called, so that ``graderd --help`` and the other clients start fast.
 """
@@ -13,13 +13,6 @@ def run_daemon(config_path: Path | None, sim: bool, rig_dir: Path | None, as_jso
     from graderd.runtime.app.daemon import run_daemon as run
 
     return run(config_path, sim, rig_dir, as_json)
-
-
-def run_demo(as_json: bool) -> int:
-    """See :func:`graderd.runtime.app.demo.run_demo`."""
-    from graderd.runtime.app.demo import run_demo as run
-
-    return run(as_json)
 
 
 def run_guard(config_path: Path | None) -> int:

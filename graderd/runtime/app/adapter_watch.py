@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from drivers.dynamixel.ph54 import Ph54Rotator
-from drivers.dynamixel.ports import latency_timer_ms
+from graderd.drivers.dynamixel.ph54 import Ph54Rotator
+from graderd.drivers.dynamixel.serial_port import latency_timer_ms
 from graderd.hal.fault import DeviceFault
 
 WANTED_MS = 1

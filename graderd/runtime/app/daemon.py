@@ -12,12 +12,12 @@ import sys
 import time
 from pathlib import Path
 
-from drivers.dynamixel.ph54 import Ph54Rotator
 from graderd.api.app import make_app
 from graderd.api.server import serve
 from graderd.config import Config, ConfigError, load
 from graderd.core import commands as cmd
 from graderd.core.machine import Mode
+from graderd.drivers.dynamixel.ph54 import Ph54Rotator
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
 from graderd.runtime.app.adapter_watch import AdapterWatch
@@ -25,9 +25,9 @@ from graderd.runtime.app.devices import build_devices, build_stop_input
 from graderd.runtime.app.services import build_services
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
 from graderd.runtime.control import ControlLoop
+from graderd.runtime.devices import open_devices
 from graderd.runtime.health import HealthWatch
-from graderd.runtime.opening import open_devices
-from graderd.runtime.perception import PerceptionWorker
+from graderd.runtime.perception_supervisor import PerceptionSupervisor
 from graderd.runtime.port import Port
 from graderd.runtime.recorder import Recorder
 from graderd.runtime.sd_notify import SystemdNotifier
@@ -89,7 +89,9 @@ class Daemon:
         self._config = config
         self._rig = rig
         self._notifier = SystemdNotifier()
-        self._eyes = PerceptionWorker(config.camera, config.camera.calibration, config.perception, config.blade, clock)
+        self._eyes = PerceptionSupervisor(
+            config.camera, config.camera.calibration, config.perception, config.blade, clock
+        )
         self._devices = build_devices(config, clock, on_bus_stop=self._stop_from_bus)
         self._loop = ControlLoop(config, self._devices, self._eyes, clock, StateFile(config.state.directory))
         rotator = self._devices.rotation
@@ -135,7 +137,9 @@ class Daemon:
                 tasks = [
                     group.create_task(self._loop.run(), name="control-tick"),
                     group.create_task(self._eyes.run(), name="perception"),
-                    group.create_task(open_devices(self._loop), name="open-devices"),
+                    group.create_task(
+                        open_devices(self._loop.devices, self._loop.connection_problems), name="open-devices"
+                    ),
                     group.create_task(self._health.run(), name="health"),
                     group.create_task(self._recorder.run(), name="recorder"),
                 ]

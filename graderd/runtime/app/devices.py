@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.dynamixel.ph54 import Ph54Rotator
-from drivers.electrak.actuator import ElectrakActuator
-from drivers.electrak.candump import candump_line
-from drivers.electrak.link import CanLink
-from drivers.stop_input import make_stop_input
 from graderd.config import Config
+from graderd.drivers.dynamixel.ph54 import Ph54Rotator
+from graderd.drivers.electrak.actuator import ElectrakActuator
+from graderd.drivers.electrak.dump import candump_line
+from graderd.drivers.j1939.link import CanLink
+from graderd.drivers.stop_input import make_stop_input
 from graderd.hal.clock import Clock
 from graderd.hal.fault import DeviceFault
 from graderd.hal.linear_actuator import LinearActuator

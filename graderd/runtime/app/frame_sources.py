@@ -25,9 +25,9 @@ def open_camera(settings: CameraSettings, real_time: bool = True) -> Camera:
         return FrameSetCamera(settings, real_time)
     if settings.source == "rig":
         # Only the simulated grader has this module's renderer; nothing else of the daemon loads it.
-        rig: Camera = importlib.import_module("drivers.rig.camera").RigCamera(settings)
+        rig: Camera = importlib.import_module("graderd.drivers.simulated.camera").RigCamera(settings)
         return rig
-    from drivers import realsense  # loaded late: a daemon on the rig needs no camera library
+    from graderd.drivers import realsense  # loaded late: a daemon on the rig needs no camera library
 
     if settings.source == "realsense":
         return realsense.RealSenseCamera(settings)
@@ -45,7 +45,7 @@ def settings_for_path(path: Path) -> CameraSettings:
         DeviceMissingError: there is nothing.
         ProtocolError: it is no kind of source that is known.
     """
-    from drivers import realsense  # loaded late, as above
+    from graderd.drivers import realsense  # loaded late, as above
 
     if not path.exists():
         raise DeviceMissingError(str(path), "no such file or folder")

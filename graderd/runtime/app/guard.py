@@ -7,9 +7,9 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
-from drivers.dynamixel.guard import safe_off as servo_safe_off
-from drivers.electrak.safe_off import safe_off as actuators_safe_off
 from graderd.config import Config, ConfigError, load
+from graderd.drivers.dynamixel.safe_off import safe_off as servo_safe_off
+from graderd.drivers.electrak.safe_off import safe_off as actuators_safe_off
 from graderd.hal.errors import DeviceError
 from graderd.runtime.app.sim import attach
 

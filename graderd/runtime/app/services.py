@@ -12,15 +12,14 @@ from typing import Any, TypeVar
 
 from pydantic import Field, ValidationError
 
-from drivers.dynamixel.ph54 import Ph54Rotator
-from drivers.dynamixel.step import StepSample, analyse
-from drivers.dynamixel.step_report import render
 from graderd.config import Config
+from graderd.drivers.dynamixel.ph54 import Ph54Rotator
+from graderd.drivers.dynamixel.step import StepSample, analyse, render
 from graderd.hal.errors import CommandRangeError, DeviceMissingError
 from graderd.hal.settings import Finite, Positive, Settings
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.maneuver import Maneuver
-from graderd.runtime.perception import PerceptionWorker
+from graderd.runtime.perception_supervisor import PerceptionSupervisor
 from graderd.runtime.port import Service
 
 T = TypeVar("T", bound=Settings)
@@ -43,7 +42,7 @@ class CalibrateArguments(Settings):
 
 
 def build_services(
-    config: Config, rotator: Ph54Rotator, loop: ControlLoop, eyes: PerceptionWorker
+    config: Config, rotator: Ph54Rotator, loop: ControlLoop, eyes: PerceptionSupervisor
 ) -> dict[str, Service]:
     """The services by name. Each takes the request's arguments and returns a JSON object."""
 
@@ -121,7 +120,7 @@ async def _step_response(
     }
 
 
-async def _collect_frames(loop: ControlLoop, eyes: PerceptionWorker, wanted: CalibrateArguments) -> dict[str, Any]:
+async def _collect_frames(loop: ControlLoop, eyes: PerceptionSupervisor, wanted: CalibrateArguments) -> dict[str, Any]:
     """Turn the empty blade to each angle and save one frame there, as a frame set."""
     limits = loop.config.gate.limits()["rotation"]
     for angle_deg in wanted.angles_deg:

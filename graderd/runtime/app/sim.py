@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 
 class RigProcess:
-    """``python -m drivers.rig`` in ``directory``; kept alive while :meth:`run` runs."""
+    """``python -m graderd.simulator`` in ``directory``; kept alive while :meth:`run` runs."""
 
     def __init__(self, directory: Path, arguments: tuple[str, ...] = ()) -> None:
         self.directory = directory
@@ -50,7 +50,16 @@ class RigProcess:
         ready = self.directory / "rig.json"
         ready.unlink(missing_ok=True)
         self._process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "drivers.rig", "--dir", str(self.directory), "--linger-s", f"{LINGER_S:g}"),
+            *(
+                sys.executable,
+                "-P",
+                "-m",
+                "graderd.simulator",
+                "--dir",
+                str(self.directory),
+                "--linger-s",
+                f"{LINGER_S:g}",
+            ),
             *self._arguments,
             stdin=asyncio.subprocess.PIPE,
             start_new_session=True,

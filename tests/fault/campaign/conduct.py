@@ -6,8 +6,8 @@ import asyncio
 import time
 from contextlib import suppress
 
-from graderd.core.fault_catalogue import CATALOGUE
-from graderd.core.faults import Clear, FaultRow, Reaction, catalogue_key
+from graderd.core.faults.catalogue import CATALOGUE
+from graderd.core.faults.monitor import Clear, FaultRow, Reaction, catalogue_key
 from tests.fault.campaign.model import Case, Outcome, Phase
 from tests.fault.campaign.stack import CampaignError, JsonObject, Stack
 from tests.fault.campaign.watch import MOVING, axes_of

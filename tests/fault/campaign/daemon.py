@@ -23,11 +23,11 @@ from types import FrameType
 from typing import Any
 
 from graderd.core import machine
-from graderd.core.fault_catalogue import CATALOGUE
-from graderd.core.faults import Clear, FaultRow, Reaction
+from graderd.core.faults.catalogue import CATALOGUE
+from graderd.core.faults.monitor import Clear, FaultRow, Reaction
 from graderd.runtime import control
 from graderd.runtime.app import daemon as product
-from graderd.runtime.perception import PerceptionWorker
+from graderd.runtime.perception_supervisor import PerceptionSupervisor
 
 WORKER = "tests.fault.campaign.worker"
 
@@ -102,7 +102,7 @@ def main() -> int:
     signal.signal(signal.SIGUSR1, Hooks(options.rig_dir).on_signal)
     os.environ["GRADERD_CAMPAIGN_LIE"] = str(options.rig_dir / "lie.json")
     command = (sys.executable, "-m", WORKER)
-    vars(product)["PerceptionWorker"] = partial(PerceptionWorker, command=command)
+    vars(product)["PerceptionWorker"] = partial(PerceptionSupervisor, command=command)
     return product.run_daemon(options.config, False, options.rig_dir, True)
 
 

@@ -15,8 +15,8 @@ from typing import Any
 
 import httpx
 
-from drivers.rig.control import RigControl
 from graderd.hal.errors import DeviceError
+from graderd.simulator.control_client import RigControl
 from tests.fault.campaign.watch import Watch
 
 START_S = 60.0
@@ -119,7 +119,7 @@ class Stack:
         ready = self.directory / "rig.json"
         ready.unlink(missing_ok=True)
         self._rig = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "drivers.rig", "--dir", str(self.directory)
+            sys.executable, "-m", "graderd.simulator", "--dir", str(self.directory)
         )
         await self.until(ready.exists, START_S, "the rig does not get ready")
         await self._control.close()

@@ -8,8 +8,8 @@ import signal
 from contextlib import suppress
 from typing import Any
 
-from drivers.rig.blade import LEVEL_TILT_MM
 from graderd.hal.errors import DeviceError
+from graderd.simulator.grader.blade import LEVEL_TILT_MM
 from tests.fault.campaign.conduct import goes_up
 from tests.fault.campaign.model import ROTATION, Action, Case, Phase
 from tests.fault.campaign.stack import Stack

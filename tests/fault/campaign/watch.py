@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.rig.control import RigControl
 from graderd.hal.errors import DeviceError
+from graderd.simulator.control_client import RigControl
 
 PERIOD_S = 0.02
 KEPT_S = 40.0

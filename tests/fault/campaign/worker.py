@@ -13,8 +13,8 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from graderd.runtime.app import worker as product
-from graderd.runtime.worker_protocol import Observed
+from graderd.runtime.app import perception_child as product
+from graderd.runtime.perception_protocol import Observed
 
 
 class LyingWorker(product.Worker):

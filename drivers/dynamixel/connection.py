@@ -1,0 +1,135 @@
+"""The way to the servo: find the port, open the bus, identify the device, and the wire's history across reconnects."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+
+from graderd.drivers.dynamixel.bus import BusLog, ServoBus
+from graderd.drivers.dynamixel.device import Ph54Device
+from graderd.drivers.dynamixel.serial_port import ListPorts, find_port
+from graderd.drivers.dynamixel.table import ControlTable
+from graderd.hal.clock import Clock
+from graderd.hal.errors import (
+    DeviceError,
+    DeviceLostError,
+    DeviceMissingError,
+    DeviceRefusedError,
+    DeviceTimeoutError,
+    WrongDeviceError,
+)
+from graderd.hal.settings import RotatorSettings
+
+_REBOOT_S = 5.0
+_LOOK_EVERY_S = 0.05
+_MANY = 1_000_000
+
+
+class ServoLink:
+    """One servo's connection; made, lost and made again. ``firmware_version``: of the servo last identified."""
+
+    def __init__(
+        self,
+        settings: RotatorSettings,
+        table: ControlTable,
+        expected_mode: int,
+        clock: Clock,
+        bus_log: BusLog | None,
+        list_ports: ListPorts,
+    ) -> None:
+        self.firmware_version: int | None = None
+        self.happened: Counter[str] = Counter()
+        self.bus: ServoBus | None = None
+        self._settings = settings
+        self._table = table
+        self._mode = expected_mode
+        self._clock = clock
+        self._bus_log = bus_log
+        self._list_ports = list_ports
+        self._device: Ph54Device | None = None
+
+    @property
+    def is_up(self) -> bool:
+        """Whether a servo was identified and its port has not been lost since."""
+        return self._device is not None and self.bus is not None and self.bus.is_open
+
+    @property
+    def device(self) -> Ph54Device:
+        """The servo.
+
+        Raises:
+            DeviceLostError: there is none at present.
+        """
+        if self._device is None:
+            raise DeviceLostError("rotation", "the servo is not connected", "Check the USB cable")
+        return self._device
+
+    async def connect(self) -> Ph54Device:
+        """Find the port, open it, identify and judge the servo.
+
+        Raises:
+            DeviceMissingError, DeviceRefusedError: as for the port.
+            WrongDeviceError, DeviceTimeoutError, DeviceLostError: as :meth:`Ph54Device.identify`.
+        """
+        s = self._settings
+        rates = self._table.profile["bus"]["baud_n"]
+        if s.baud_n not in rates:
+            cause = f"{self._table.title} cannot run at {s.baud_n} bit/s"
+            raise DeviceRefusedError("rotation", cause, f"Choose one of {rates}")
+        port = find_port(s.port, s.usb_serial_number, self._list_ports)
+        self.bus = ServoBus(port, s.baud_n, clock=self._clock, bus_log=self._bus_log)
+        self.bus.open()
+        device = Ph54Device(self.bus, self._table, s.servo_id_n)
+        self.firmware_version = await device.identify(self._mode)
+        self._device = device
+        return device
+
+    def disconnect(self) -> None:
+        """Let go of the port and remember what was counted. Idempotent."""
+        self._device = None
+        if self.bus is not None:
+            bus, self.bus = self.bus, None
+            bus.close()
+            counted = bus.counters()
+            counted.pop("low_latency_n")
+            self.happened.update(counted)
+
+    def counters(self) -> dict[str, int]:
+        """Everything since the beginning, over all connections; ``low_latency_n`` is of the present one."""
+        now = Counter(self.bus.counters()) if self.bus is not None else Counter[str]()
+        low_latency_n = now.pop("low_latency_n", 0)
+        return {**(self.happened + now), "low_latency_n": low_latency_n}
+
+    def silence(self) -> tuple[float, int]:
+        """Seconds since the last valid status packet, and requests without an answer since."""
+        if self.bus is None:
+            return float("inf"), _MANY
+        return self._clock.now_s() - self.bus.last_valid_s, self.bus.unanswered_n
+
+    async def reboot(self) -> None:
+        """Reboot the servo and wait until it is back and fits.
+
+        Raises:
+            DeviceTimeoutError: it did not come back in time.
+            WrongDeviceError, DeviceLostError: as :meth:`Ph54Device.identify`.
+        """
+        loop, device = asyncio.get_running_loop(), self.device
+        await device.reboot()
+        until_s = loop.time() + _REBOOT_S
+        while True:
+            await asyncio.sleep(_LOOK_EVERY_S)
+            try:
+                self.firmware_version = await device.identify(self._mode)
+                return
+            except DeviceTimeoutError:
+                if loop.time() > until_s:
+                    raise
+
+
+def condition_of(error: DeviceError) -> str:
+    """The fault's name for an error that ended or prevented a connection."""
+    if isinstance(error, WrongDeviceError):
+        return "wrong_device"
+    if isinstance(error, DeviceMissingError | DeviceLostError):
+        return "unplugged"
+    return "no_reply"

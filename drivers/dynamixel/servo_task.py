@@ -1,0 +1,398 @@
+"""The task that owns the servo's wire: it polls, sends what was commanded, and goes on looking for a lost servo."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+from collections.abc import Coroutine
+
+from graderd.drivers.dynamixel import arming
+from graderd.drivers.dynamixel.bus import ServoRefusedError
+from graderd.drivers.dynamixel.calibration import Calibration
+from graderd.drivers.dynamixel.codec import StatusError
+from graderd.drivers.dynamixel.connection import ServoLink, condition_of
+from graderd.drivers.dynamixel.device import ATTEMPTS_N, Ph54Device
+from graderd.drivers.dynamixel.observer import MOTION_FAULTS, ServoObserver
+from graderd.hal.clock import Clock
+from graderd.hal.errors import DeviceError, DeviceLostError, DeviceTimeoutError
+from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.settings import RotatorSettings
+
+
+class CommandSlot:
+    """What was commanded and what of it the servo has taken.
+
+    ``goal_deg``: the goal in force, None while holding. ``hold_wanted``: a hold that has not gone out yet.
+    """
+
+    def __init__(self, settings: RotatorSettings, calibration: Calibration) -> None:
+        self.goal_deg: float | None = None
+        self.hold_wanted = False
+        self._goal_s = -math.inf
+        self._settings = settings
+        self._calibration = calibration
+        self._sent_counts: int | None = None
+        self._braking = False
+
+    def goal(self, goal_deg: float, now_s: float) -> None:
+        """The newest goal wins, also over a hold that has not gone out yet."""
+        self.goal_deg, self._goal_s, self.hold_wanted = goal_deg, now_s, False
+
+    def hold(self) -> None:
+        """Hold with the next packet; nothing to do where the last thing sent was a hold."""
+        if self.goal_deg is None and self._braking and not self.hold_wanted:
+            return
+        self.goal_deg, self.hold_wanted = None, True
+
+    def forget(self, sent_counts: int | None = None) -> None:
+        """No command in force; ``sent_counts``: the goal that arming has left on the servo."""
+        self.goal_deg, self.hold_wanted, self._braking = None, False, False
+        self._sent_counts = sent_counts
+
+    def expired(self, now_s: float) -> bool:
+        """Whether the goal was not renewed in time."""
+        return self.goal_deg is not None and now_s - self._goal_s > self._settings.goal_timeout_s
+
+    async def send_hold(self, device: Ph54Device, measured_deg: float) -> int:
+        """Goal := measured with a harder profile, in one packet. Returns the counts sent."""
+        low, high = self._calibration.servo_limits()
+        counts = max(low, min(high, self._calibration.counts(measured_deg)))  # beyond them the servo would refuse
+        profile = arming.profile_counts(self._settings, self._calibration, arming.HOLD_ACCELERATION_FACTOR)
+        await device.write_block(device.profile_block, {**profile, "goal_position": counts}, attempts_n=1, urgent=True)
+        self._braking, self.hold_wanted, self._sent_counts = True, False, counts
+        return counts
+
+    async def send_goal(self, device: Ph54Device) -> int | None:
+        """The goal, where the servo has not got it yet. Returns the counts sent, None where nothing was to send."""
+        if self.goal_deg is None:
+            return None
+        counts = self._calibration.counts(self.goal_deg)
+        if self._braking:
+            profile = arming.profile_counts(self._settings, self._calibration)
+            await device.write_block(device.profile_block, {**profile, "goal_position": counts}, attempts_n=1)
+            self._braking = False
+        elif counts != self._sent_counts:
+            await device.write("goal_position", counts, attempts_n=1)
+        else:
+            return None
+        self._sent_counts = counts
+        return counts
+
+
+log = logging.getLogger(__name__)
+
+DEVICE = "rotation"
+LINK_FAULTS = ("no_reply", "corrupt_replies", "unplugged", "wrong_device")
+"""Conditions that end when the servo is found again."""
+_HEALTH_EVERY_S = 0.1
+_GOALS_EVERY_S = 0.5
+_RECONNECT_FIRST_S = 0.1
+_RECONNECT_MOST_S = 1.0
+_RUNAWAY_DEG = 8.0
+"""Braking from the fastest permitted turn takes 5.2 degrees. A blade that goes further under a hold is not braking: its
+servo runs the wrong way, and a goal, even that of staying, only drives it on."""
+_STOP_S = 0.5
+"""A disarm gives the blade so long to come to rest before torque goes off."""
+_STILL_READS_N = 5
+"""So many reads in a row without movement are rest; one alone may be a turning point."""
+_UNANSWERED_N = 3
+"""A lost servo left at least so many requests unanswered: a program that stood still asked none."""
+
+
+class ServoTask:
+    """Keeps one servo in the state it should be in, poll by poll, whatever the wire does.
+
+    ``lifecycle``: the rotator's, set by it and by what happens here. ``torque_is_ours``: torque was switched on by us.
+    ``turn``: held by whoever has several exchanges to make that belong together.
+    """
+
+    def __init__(
+        self, settings: RotatorSettings, link: ServoLink, observer: ServoObserver, command: CommandSlot, clock: Clock
+    ) -> None:
+        self.lifecycle = Lifecycle.CLOSED
+        self.torque_is_ours = False
+        self.turn = asyncio.Lock()
+        self._settings = settings
+        self._link = link
+        self._observer = observer
+        self._command = command
+        self._clock = clock
+        self._task: asyncio.Task[None] | None = None
+        self._wake = asyncio.Event()
+        self._readers: list[asyncio.Future[None]] = []
+        self._powering_down = False
+
+    def start(self) -> None:
+        """Begin to poll."""
+        self._task = asyncio.get_running_loop().create_task(self._run(), name="rotation-servo")
+        self._task.add_done_callback(self._on_task_done)
+
+    async def stop(self) -> None:
+        """End the task and let go of the wire; idempotent."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+        self._link.disconnect()
+        self._command.forget()
+        self._tell_readers()
+
+    def wake(self) -> None:
+        """There is a command: it goes out at once, not with the next poll."""
+        self._wake.set()
+
+    async def next_poll(self) -> None:
+        """Wait until telemetry was read, or the connection's state changed."""
+        reader: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._readers.append(reader)
+        await reader
+
+    # -- connection -------------------------------------------------------------------------------------------
+
+    async def connect(self) -> None:
+        """Find and identify the servo, and look around; nothing moves and torque is left as it is.
+
+        Raises:
+            DeviceError: see :meth:`ServoLink.connect`.
+        """
+        self._observer.new_wire()
+        await self.look_around(await self._link.connect())
+        self._observer.faults.clear(*LINK_FAULTS)
+
+    async def look_around(self, device: Ph54Device) -> None:
+        """First readings of a servo just found, and what its registers tell of the time without us."""
+        observer = self._observer
+        observer.restart(position_known=True)
+        goals = await observer.read_goals(device, attempts_n=ATTEMPTS_N)
+        await observer.read_health(device, attempts_n=ATTEMPTS_N)
+        await observer.read_telemetry(device, None, attempts_n=ATTEMPTS_N)
+        if self.torque_is_ours and not observer.torque_on:
+            observer.name_torque_loss(goals)
+        await self._make_safe(device)
+
+    async def _make_safe(self, device: Ph54Device) -> None:
+        """Torque that we had switched on goes where ``torque_at_disarm`` says. A stranger's torque is left alone."""
+        observer = self._observer
+        self._command.forget()
+        if self.torque_is_ours and observer.torque_on and self._settings.torque_at_disarm == "off":
+            await self._torque_off(device)
+        self.torque_is_ours = self.torque_is_ours and observer.torque_on
+        if observer.tripped and not observer.torque_on:  # unpowered, no stale goal can come alive
+            await device.write("bus_watchdog", 0)
+            observer.tripped = False
+
+    async def _torque_off(self, device: Ph54Device) -> None:
+        await device.torque(False)
+        self._observer.set_torque(False)
+
+    # -- leaving --------------------------------------------------------------------------------------------
+
+    async def power_down(self, *, off: bool, leaving: bool = False) -> None:
+        """Hold, wait for rest, then torque off where asked; leaving with torque on, the watchdog is taken off duty."""
+        self._powering_down = True
+        try:
+            await self._power_down_in_turn(off=off, leaving=leaving)
+        finally:
+            self._powering_down = False
+
+    async def _power_down_in_turn(self, *, off: bool, leaving: bool) -> None:
+        async with self.turn:
+            device = self._link.device
+            self._command.hold()
+            loop = asyncio.get_running_loop()
+            until_s, still_n = loop.time() + _STOP_S, 0
+            began = None  # where the blade was when the servo had taken the hold, which a bad line may delay
+            while loop.time() < until_s and still_n < _STILL_READS_N:
+                await self._tolerant(self._send_command(device))
+                await self._tolerant(self._observer.read_telemetry(device, None))
+                speed, angle = self._observer.telemetry.velocity_deg_per_s, self._observer.telemetry.angle_deg
+                still_n = still_n + 1 if speed is not None and abs(speed.value) < 1.0 else 0
+                if began is None and not self._command.hold_wanted:
+                    began = angle
+                if off and began is not None and angle is not None and abs(angle.value - began.value) > _RUNAWAY_DEG:
+                    log.warning("%s: does not obey the hold: torque off without waiting for rest", DEVICE)
+                    break
+            if off:
+                await self._torque_off(device)
+                self.torque_is_ours = False
+            elif leaving:
+                await device.write("bus_watchdog", 0)
+
+    # -- the servo's own task ---------------------------------------------------------------------------------
+
+    def _on_task_done(self, task: asyncio.Task[None]) -> None:
+        """The owner of the wire must not die while the rotator is open: start it again."""
+        if task is self._task and self.lifecycle is not Lifecycle.CLOSED:
+            cause = "was cancelled" if task.cancelled() else f"failed: {task.exception()!r}"
+            log.error("%s: the servo task %s; starting it again", DEVICE, cause)
+            self._fail(DeviceLostError(DEVICE, f"the servo task {cause}"))
+            self.start()
+
+    async def _run(self) -> None:
+        pause_s = _RECONNECT_FIRST_S
+        while True:
+            try:
+                if not self._link.is_up:
+                    self._link.disconnect()
+                    async with self.turn:
+                        await self.connect()
+                        self.lifecycle = Lifecycle.STANDBY
+                    self._link.happened["reconnects_n"] += 1
+                    log.info("%s: servo found at %s", DEVICE, self._link.bus.port if self._link.bus else "?")
+                pause_s = _RECONNECT_FIRST_S
+                await self._serve()
+            except DeviceError as e:
+                self._fail(e)
+            except Exception as e:  # a bug in here must not end the search for the servo
+                log.exception("%s: unexpected error in the servo task", DEVICE)
+                self._fail(DeviceLostError(DEVICE, f"internal error {e!r}"))
+            await asyncio.sleep(pause_s)
+            pause_s = min(_RECONNECT_MOST_S, 2 * pause_s)
+
+    def _fail(self, error: DeviceError) -> None:
+        condition, faults = condition_of(error), self._observer.faults
+        if condition == "no_reply" and self._observer.damaged_lately():
+            condition = "corrupt_replies"
+        if faults.set(condition, error.cause, self._clock.now_s()):
+            log.warning("%s: %s", condition, error)
+        faults.clear(*(c for c in LINK_FAULTS if c != condition), *MOTION_FAULTS)
+        self.lifecycle = Lifecycle.FAILED
+        self._command.forget()
+        self._link.disconnect()
+        self._tell_readers()
+
+    def _tell_readers(self) -> None:
+        readers, self._readers = self._readers, []
+        for reader in readers:
+            if not reader.done():
+                reader.set_result(None)
+
+    async def _serve(self) -> None:
+        """Poll until the servo is lost."""
+        loop = asyncio.get_running_loop()
+        period_s = 1.0 / self._settings.poll_hz
+        next_s = loop.time()
+        while True:
+            async with self.turn:
+                await self._cycle(self._link.device)
+            next_s = max(next_s + period_s, loop.time())
+            await self._until(next_s)
+
+    async def _until(self, next_s: float) -> None:
+        """Sleep until the next poll; a command that comes in between goes out at once."""
+        loop = asyncio.get_running_loop()
+        while (left_s := next_s - loop.time()) > 0:
+            if not self._wake.is_set():
+                timer = loop.call_later(left_s, self._wake.set)
+                try:
+                    await self._wake.wait()
+                finally:
+                    timer.cancel()
+            self._wake.clear()
+            async with self.turn:
+                await self._tolerant(self._send_command(self._link.device))
+
+    async def _cycle(self, device: Ph54Device) -> None:
+        """One poll: command, telemetry, and now and then what changes rarely; a command never waits for two reads."""
+        observer, now_s = self._observer, self._clock.now_s()
+        self._wake.clear()
+        if self._command.expired(now_s):
+            self._link.happened["goal_timeouts_n"] += 1
+            self._command.hold()
+        await self._tolerant(self._send_command(device))
+        await self._tolerant(observer.read_telemetry(device, self._standing_goal_deg()))
+        self._tell_readers()
+        if now_s - observer.health_s >= _HEALTH_EVERY_S:
+            await self._tolerant(self._send_command(device))
+            await self._tolerant(observer.read_health(device))
+        if now_s - observer.goals_s >= _GOALS_EVERY_S:
+            await self._tolerant(self._send_command(device))
+            await self._tolerant(self._check_goals(device))
+        await self._tolerant(self._protect(device))
+        if self._link.bus is not None:
+            observer.count_damage(self._link.bus)
+
+    def _standing_goal_deg(self) -> float | None:
+        """What the servo was last told to do; None while nothing is powered by us."""
+        sent = self._observer.telemetry.goal_sent_deg
+        return sent.value if self.lifecycle is Lifecycle.ACTIVE and sent is not None else None
+
+    async def _check_goals(self, device: Ph54Device) -> None:
+        """Whether the watchdog still stands as it was written."""
+        goals = await self._observer.read_goals(device)
+        wanted, found = arming.watchdog_counts(self._settings), goals["bus_watchdog"]
+        if self.lifecycle is Lifecycle.ACTIVE and not self._observer.tripped and found != wanted:
+            detail = f"the bus watchdog reads {found}, not {wanted} as written"
+            await self._end_active(device, "ram_reset", detail)
+
+    async def _protect(self, device: Ph54Device) -> None:
+        """End ACTIVE where torque is gone, the watchdog has tripped or turns were lost. Only arm() brings it back.
+
+        In STANDBY finish what an interrupted disarm left: torque of ours that should be off, a trip to be cleared.
+        """
+        observer = self._observer
+        if self.lifecycle is Lifecycle.ACTIVE:
+            if not observer.torque_on:
+                await self._end_active(device)
+                observer.name_torque_loss(await observer.read_goals(device, attempts_n=ATTEMPTS_N))
+            elif observer.tripped or observer.turns_jumped:
+                await self._end_active(device)
+        elif not self._powering_down and (
+            (self.torque_is_ours and observer.torque_on and self._settings.torque_at_disarm == "off")
+            or (observer.tripped and not observer.torque_on)
+        ):
+            await self._make_safe(device)
+
+    async def _end_active(self, device: Ph54Device, condition: str = "", detail: str = "") -> None:
+        self.lifecycle = Lifecycle.STANDBY
+        if condition:
+            self._observer.faults.event(condition, detail, self._clock.now_s())
+        await self._make_safe(device)
+
+    async def _tolerant(self, step: Coroutine[None, None, None]) -> None:
+        """Carry out one exchange; a lost packet is nothing, no valid one for ``reply_timeout_s`` is a lost servo."""
+        try:
+            await step
+        except DeviceTimeoutError as e:
+            silent_s, unanswered_n = self._link.silence()
+            if silent_s > self._settings.reply_timeout_s and unanswered_n >= _UNANSWERED_N:
+                c = self._link.counters()
+                seen = f"{c.get('requests_n', 0)} requests, {c.get('foreign_n', 0)} replies with another id"
+                cause = f"no valid status packet for {silent_s:.2f} s ({seen})"
+                raise DeviceTimeoutError(e.where, cause, e.remedy) from e
+
+    async def _send_command(self, device: Ph54Device) -> None:
+        """Send what was commanded last: a hold, or a goal that is not on the servo yet."""
+        command, observer, sent = self._command, self._observer, None
+        try:
+            if command.hold_wanted:
+                angle = observer.telemetry.angle_deg
+                if not observer.torque_on or angle is None:
+                    command.forget()  # nothing is powered: nothing to hold
+                    return
+                if not angle.is_fresh(self._clock.now_s(), self._settings.reply_timeout_s):
+                    await observer.read_telemetry(device, None)
+                    angle = observer.telemetry.angle_deg or angle
+                sent = await command.send_hold(device, angle.value)
+            elif self.lifecycle is Lifecycle.ACTIVE:
+                sent = await command.send_goal(device)
+        except ServoRefusedError as e:
+            await self._on_refusal(device, e)
+        if sent is not None:
+            observer.note_sent(sent)
+
+    async def _on_refusal(self, device: Ph54Device, error: ServoRefusedError) -> None:
+        """A goal was refused: the watchdog has tripped, or the servo is not as we left it. Never go on blindly."""
+        log.warning("%s: %s", DEVICE, error)
+        was_active = self.lifecycle is Lifecycle.ACTIVE
+        if was_active:
+            self.lifecycle = Lifecycle.STANDBY
+        if error.error == StatusError.DATA_RANGE:
+            await self._observer.read_goals(device, attempts_n=ATTEMPTS_N)
+        elif was_active:
+            detail = f"a goal was refused: {error.cause}"
+            self._observer.faults.event("ram_reset", detail, self._clock.now_s())
+        await self._make_safe(device)

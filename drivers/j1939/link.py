@@ -1,0 +1,409 @@
+"""The CAN link: one owner of the bus, its own reader, a steady schedule of control messages, a supervisor.
+
+Several actuators share one :class:`CanLink`. It claims our J1939 address, sends every actuator's control message on
+a fixed 100 ms grid, hands feedback out by source address, tells stop messages, publishes DM1, and opens the bus again
+with back-off when it was lost.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+from graderd.drivers.j1939 import dm1
+from graderd.drivers.j1939.bus_health import BusEvent, BusHealth
+from graderd.drivers.j1939.can_port import BusPort, PortFullError, PortLostError, open_port
+from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
+from graderd.drivers.j1939.name import Name
+from graderd.drivers.j1939.node import Identity, J1939Node
+from graderd.drivers.j1939.stop_message import StopWatcher
+from graderd.drivers.j1939.ticker import Ticker
+from graderd.drivers.j1939.transport import Message
+from graderd.hal.clock import Clock, SystemClock
+from graderd.hal.errors import DeviceError, DeviceMissingError
+from graderd.hal.fault import DeviceFault
+from graderd.hal.settings import CanSettings
+
+
+class LinkUser(Protocol):
+    """What the link wants of an actuator. The methods never wait."""
+
+    @property
+    def address(self) -> int:
+        """J1939 address of the actuator."""
+        ...
+
+    def control_data(self, now_s: float) -> bytes:
+        """Content of the control message that goes out now."""
+        ...
+
+    def on_feedback(self, data: bytes, now_s: float) -> None:
+        """A feedback message from this address."""
+        ...
+
+    def on_claim(self, name: int, solicited: bool, now_s: float) -> None:
+        """An address claim from this address; ``solicited`` where somebody asked for claims just before."""
+        ...
+
+    def on_link_lost(self, now_s: float) -> None:
+        """The bus is gone; nothing can be sent."""
+        ...
+
+    def hold(self) -> None:
+        """Disable motion from the next control message on."""
+        ...
+
+
+_log = logging.getLogger(__name__)
+
+ACM_PERIOD_S: Final = 0.1
+_POLL_S: Final = 0.02
+_AHEAD_S: Final = 0.0004
+"""Wake-ups come so much before their time: more than waking up and encoding mostly take, so that control messages keep
+their period to some microseconds. What is left of it is spun, ten times a second."""
+_BACKOFF_FIRST_S: Final = 0.1
+_BACKOFF_MAX_S: Final = 2.0
+_CLOSE_REPEATS_N: Final = 3
+_ACM_PRIORITY: Final = 6
+_AFM_MASK: Final = 0x03FFFF00
+_AFM_MATCH: Final = 0x01EFFF00
+
+
+@dataclass(slots=True)
+class LinkCounters:
+    """What the link did since it was made."""
+
+    rx_n: int = 0
+    tx_n: int = 0
+    tx_full_n: int = 0
+    lost_n: int = 0
+    reopened_n: int = 0
+    acm_late_max_s: float = 0.0
+
+
+@dataclass(slots=True)
+class _Taps:
+    frames: list[Callable[[Frame, float], None]] = field(default_factory=list)
+    messages: list[Callable[[Message, float], None]] = field(default_factory=list)
+
+
+class CanLink:
+    """The J1939 bus of the actuators.
+
+    ``on_stop`` is called, with the reason in words, for a stop message (ISO 11783-7 or the configured PGN).
+    ``bus_factory`` replaces the opening of ``settings.interface`` (in-process buses of tests). All methods belong to
+    one event loop.
+    """
+
+    def __init__(
+        self,
+        settings: CanSettings,
+        clock: Clock | None = None,
+        *,
+        on_stop: Callable[[str], None] | None = None,
+        bus_factory: Callable[[], BusPort] | None = None,
+        software: str = "graderd",
+    ) -> None:
+        self.settings = settings
+        self.counters = LinkCounters()
+        self._clock = clock or SystemClock()
+        self._factory = bus_factory
+        self._node = J1939Node(
+            name_from(settings),
+            settings.source_address_n,
+            identity=Identity(serial_number=str(settings.name_identity_n), software=software),
+            obey_commanded=settings.obey_commanded_address,
+        )
+        self._health = BusHealth()
+        self._stop = StopWatcher(settings.stop_pgn_n, settings.stop_on_iso11783_all_stop, on_stop)
+        self._port: BusPort | None = None
+        self._users: dict[int, LinkUser] = {}
+        self._strangers: dict[int, float] = {}
+        self._taps = _Taps()
+        self._tasks: list[asyncio.Task[None]] = []
+        self._lost = asyncio.Event()
+        self._opening = asyncio.Lock()
+
+    # -- state ------------------------------------------------------------------------------------------------------
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a way onto the bus now."""
+        return self._port is not None
+
+    @property
+    def address(self) -> int | None:
+        """Our claimed address; None while it may not be used."""
+        return self._node.address if self._port is not None else None
+
+    @property
+    def node(self) -> J1939Node:
+        """The protocol machine, for its counters and the addresses seen."""
+        return self._node
+
+    @property
+    def where(self) -> str:
+        """Interface and channel, for messages."""
+        return f"CAN {self.settings.interface} {self.settings.channel}"
+
+    def faults(self) -> tuple[DeviceFault, ...]:
+        """Conditions of the bus present now, device ``can``."""
+        now_s = self._clock.now_s()
+        self._health.watch_claim(self._node.claimer, now_s)
+        return self._health.faults(now_s)
+
+    def unknown_feedback_addresses(self, now_s: float) -> tuple[int, ...]:
+        """Addresses that sent actuator feedback within the last second and belong to no configured actuator."""
+        return tuple(sorted(a for a, t in self._strangers.items() if now_s - t < 1.0))
+
+    # -- life -------------------------------------------------------------------------------------------------------
+
+    async def open(self) -> None:
+        """Open the bus, claim our address and start the schedule; does nothing where that is done.
+
+        Afterwards the link keeps itself: a lost bus is closed at once and opened again with back-off.
+
+        Raises:
+            DeviceMissingError: the channel does not exist, is down, or cannot be opened.
+        """
+        async with self._opening:
+            if self._tasks:
+                return
+            await self._open_port()
+            self._tasks = [
+                asyncio.create_task(self._schedule(), name="can-schedule"),
+                asyncio.create_task(self._supervise(), name="can-supervisor"),
+            ]
+
+    async def close(self) -> None:
+        """Motion disabled several times for every actuator, then silent and closed; idempotent."""
+        tasks, self._tasks = self._tasks, []
+        for task in tasks:
+            task.cancel()
+        for task in tasks:
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+        for user in self._users.values():
+            user.hold()
+        if self._port is not None:
+            for repeat in range(_CLOSE_REPEATS_N):
+                if repeat:
+                    await asyncio.sleep(0.01)
+                for user in self._users.values():
+                    self.send_control(user)
+        self._drop_port()
+
+    def attach(self, user: LinkUser) -> None:
+        """Put an actuator on the schedule.
+
+        Raises:
+            DeviceError: another one has the same address.
+        """
+        if self._users.get(user.address, user) is not user:
+            raise DeviceError(self.where, f"two actuators are configured for address {user.address}", "Check address_n")
+        self._users[user.address] = user
+
+    def detach(self, user: LinkUser) -> None:
+        """Take an actuator off the schedule; its messages stop."""
+        if self._users.get(user.address) is user:
+            del self._users[user.address]
+
+    def tap(self, listener: Callable[[Frame, float], None]) -> Callable[[], None]:
+        """Call ``listener`` with every frame received or sent; returns the call that ends it."""
+        self._taps.frames.append(listener)
+        return lambda: self._taps.frames.remove(listener)
+
+    def tap_messages(self, listener: Callable[[Message, float], None]) -> Callable[[], None]:
+        """Call ``listener`` with every J1939 message, multi-packet ones included; returns the call that ends it."""
+        self._taps.messages.append(listener)
+        return lambda: self._taps.messages.remove(listener)
+
+    # -- sending ----------------------------------------------------------------------------------------------------
+
+    def send_control(self, user: LinkUser) -> bool:
+        """Send one actuator's control message now; False where that is impossible."""
+        frame = self._control(user)
+        return frame is not None and self._send(frame)
+
+    def request(self, pgn: int, destination: int = 0xFF) -> None:
+        """Ask for a parameter group; the answer comes through :meth:`tap_messages`."""
+        self._node.request(pgn, destination, now_s=self._clock.now_s())
+        self._flush()
+
+    def publish_faults(self, faults: Iterable[DeviceFault], *, stopped: bool = False) -> None:
+        """Send the daemon's faults as DM1: amber lamp with any fault, red stop lamp while ``stopped``."""
+        dtcs = sorted({dm1.dtc_of(fault.device, fault.condition) for fault in faults}, key=lambda d: (d.spn, d.fmi))
+        self._node.publish(dtcs, amber=bool(dtcs), red=stopped, now_s=self._clock.now_s())
+
+    def _control(self, user: LinkUser) -> Frame | None:
+        """An actuator's control message as it is now; None while nothing can be sent."""
+        address = self._node.address
+        if self._port is None or address is None:
+            return None
+        can_id = make_id(_ACM_PRIORITY, Pgn.PROPRIETARY_A, address, user.address)
+        return Frame(can_id, user.control_data(self._clock.now_s()))
+
+    def _send(self, frame: Frame) -> bool:
+        if self._port is None:
+            return False
+        try:
+            self._port.send(frame)
+        except PortFullError as error:
+            self.counters.tx_full_n += 1
+            self._health.on_transmit_full(str(error), self._clock.now_s())
+            return False
+        except PortLostError as error:
+            self._on_lost(error)
+            return False
+        self.counters.tx_n += 1
+        if self._taps.frames:
+            now_s = self._clock.now_s()
+            for tap in self._taps.frames:
+                tap(frame, now_s)
+        return True
+
+    def _flush(self) -> None:
+        for frame in self._node.take():
+            self._send(frame)
+
+    # -- receiving --------------------------------------------------------------------------------------------------
+
+    def _on_readable(self) -> None:
+        port = self._port
+        if port is None:
+            return
+        try:
+            items = port.read()
+        except PortLostError as error:
+            self._on_lost(error)
+            return
+        now_s = self._clock.now_s()
+        for item in items:
+            if isinstance(item, BusEvent):
+                self._health.on_event(item, now_s)
+            else:
+                self._on_frame(item, now_s)
+        self.counters.rx_n += len(items)
+        self._health.on_traffic(len(items), now_s)
+        if port.pending:
+            asyncio.get_running_loop().call_soon(self._on_readable)
+        if self._node.outbox:
+            self._flush()
+
+    def _on_frame(self, frame: Frame, now_s: float) -> None:
+        for tap in self._taps.frames:
+            tap(frame, now_s)
+        if not frame.extended:
+            return
+        can_id = frame.can_id
+        if can_id & _AFM_MASK == _AFM_MATCH:
+            source = source_of(can_id)
+            user = self._users.get(source)
+            if user is not None:
+                user.on_feedback(frame.data, now_s)
+            else:
+                self._strangers[source] = now_s
+            return
+        if pgn_of(can_id) == Pgn.ADDRESS_CLAIMED:
+            self._on_claim(frame, now_s)
+        message = self._node.on_frame(frame, now_s)
+        if message is not None:
+            self._stop.on_message(message, now_s)
+            for listener in self._taps.messages:
+                listener(message, now_s)
+
+    def _on_claim(self, frame: Frame, now_s: float) -> None:
+        user = self._users.get(source_of(frame.can_id))
+        if user is not None and len(frame.data) == 8:
+            solicited = now_s - self._node.claim_requested_at_s < 0.5
+            user.on_claim(int.from_bytes(frame.data, "little"), solicited, now_s)
+
+    # -- schedule and supervision -----------------------------------------------------------------------------------
+
+    async def _schedule(self) -> None:
+        """Every 20 ms protocol timers, every 100 ms on the same grid control messages; no catching up."""
+        ticker = Ticker(_POLL_S, kernel=isinstance(self._clock, SystemClock), ahead_s=_AHEAD_S)
+        per_acm_n = round(ACM_PERIOD_S / _POLL_S)
+        tick_n, sent_for_n = 0, -1
+        try:
+            while True:
+                if tick_n // per_acm_n != sent_for_n and self._port is not None:
+                    sent_for_n = tick_n // per_acm_n
+                    frames = [frame for user in self._users.values() if (frame := self._control(user)) is not None]
+                    ticker.meet()
+                    self.counters.acm_late_max_s = max(self.counters.acm_late_max_s, ticker.late_s)
+                    for frame in frames:
+                        self._send(frame)
+                self._node.poll(self._clock.now_s())
+                self._flush()
+                tick_n += await ticker.wait()
+        finally:
+            ticker.close()
+
+    async def _supervise(self) -> None:
+        """Open the bus again whenever it was lost, for as long as the link lives."""
+        while True:
+            await self._lost.wait()
+            backoff_s = _BACKOFF_FIRST_S
+            while self._port is None:
+                await asyncio.sleep(backoff_s)
+                backoff_s = min(2 * backoff_s, _BACKOFF_MAX_S)
+                try:
+                    await self._open_port()
+                    self.counters.reopened_n += 1
+                except DeviceError as error:
+                    self._health.on_open_failed(error, self._clock.now_s())
+                except Exception:  # a bug in here must not end the search for the bus
+                    _log.exception("%s: opening failed in an unexpected way; will try again", self.where)
+
+    async def _open_port(self) -> None:
+        self._lost.clear()
+        if self._factory is not None:
+            port = self._factory()
+        else:
+            port = await asyncio.to_thread(open_port, self.settings)
+        now_s = self._clock.now_s()
+        self._port = port
+        self._health.on_open()
+        asyncio.get_running_loop().add_reader(port.fileno(), self._on_readable)
+        self._node.start(now_s)
+        self._flush()
+
+    def _on_lost(self, error: PortLostError) -> None:
+        now_s = self._clock.now_s()
+        _log.warning("%s: lost (%s): %s", self.where, error.condition, error.detail)
+        self.counters.lost_n += 1
+        self._health.on_lost(error.condition, error.detail, now_s)
+        self._drop_port()
+        for user in tuple(self._users.values()):
+            user.on_link_lost(now_s)
+        self._lost.set()
+
+    def _drop_port(self) -> None:
+        port, self._port = self._port, None
+        if port is not None:
+            with contextlib.suppress(ValueError, OSError):
+                asyncio.get_running_loop().remove_reader(port.fileno())
+            port.close()
+
+
+def name_from(settings: CanSettings) -> Name:
+    """Our NAME, field by field from the settings."""
+    return Name(
+        identity=settings.name_identity_n,
+        manufacturer=settings.name_manufacturer_n,
+        ecu_instance=settings.name_ecu_instance_n,
+        function_instance=settings.name_function_instance_n,
+        function=settings.name_function_n,
+        vehicle_system=settings.name_vehicle_system_n,
+        vehicle_system_instance=settings.name_vehicle_system_instance_n,
+        industry_group=settings.name_industry_group_n,
+        arbitrary_address_capable=int(settings.name_arbitrary_address),
+    )
+
+
+__all__ = ["ACM_PERIOD_S", "CanLink", "DeviceMissingError", "LinkCounters", "LinkUser", "name_from"]

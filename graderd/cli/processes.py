@@ -1,0 +1,103 @@
+"""Commands that become a process of their own: ``graderd run``, ``guard``, ``rig`` and ``demo``."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from graderd.cli.console import TAKES_ANYTHING, CliError, ExitCode, Json, example, hand_over, print_json
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    _run(app)
+    _guard(app)
+    _rig(app)
+    _demo(app)
+
+
+def _run(app: typer.Typer) -> None:
+
+    @app.command(epilog=example("graderd run --config /etc/graderd/graderd.toml", "graderd run --sim"))
+    def run(
+        config: Annotated[
+            Path | None, typer.Option(help="Configuration file. Default: /etc/graderd/graderd.toml if it exists.")
+        ] = None,
+        sim: Annotated[bool, typer.Option("--sim", help="Start a simulated grader and run on that.")] = False,
+        rig_dir: Annotated[
+            Path | None, typer.Option(help="Run on the simulated grader that serves this directory.")
+        ] = None,
+        json: Json = False,
+    ) -> None:
+        """Run the daemon until SIGINT or SIGTERM.
+
+        It starts disarmed. With --json it logs one object a line.
+        """
+        if sim and rig_dir is not None:
+            raise CliError("run", "--sim and --rig-dir exclude each other", "give one of the two", ExitCode.USAGE)
+        from graderd.runtime.app import run_daemon
+
+        raise typer.Exit(run_daemon(config, sim, rig_dir, json))
+
+
+def _guard(app: typer.Typer) -> None:
+
+    @app.command(epilog=example("graderd guard --config /etc/graderd/graderd.toml"))
+    def guard(
+        config: Annotated[
+            Path | None, typer.Option(help="Configuration file. Default: /etc/graderd/graderd.toml if it exists.")
+        ] = None,
+        json: Json = False,
+    ) -> None:
+        """Make the machine safe without a daemon.
+
+        Sends motion-disable to the actuators and makes the servo safe. systemd runs it whenever the daemon has
+        ended, whatever it ended of.
+        """
+        from graderd.runtime.app import run_guard
+
+        log = logging.getLogger("graderd")
+        log.addHandler(logging.StreamHandler())
+        log.setLevel(logging.INFO)
+        status = run_guard(config)
+        if json:
+            print_json({"safe": status == 0})
+        raise typer.Exit(status)
+
+
+def _rig(app: typer.Typer) -> None:
+
+    @app.command(
+        context_settings=TAKES_ANYTHING,
+        epilog=example(
+            "graderd rig --dir grader --seed 1",
+            "graderd rig dataset --out frames --scenes 300 --seed 7",
+            "graderd rig -- --help          (all its options)",
+        ),
+    )
+    def rig(context: typer.Context) -> None:
+        """Run the simulated grader, or write a data set with it.
+
+        Soil, blade, camera, virtual servo and virtual actuators in a process of their own, which announces itself in
+        rig.json in its directory (a JSON object). 'dataset' writes a set of labelled frames instead. All further
+        arguments are the rig's own.
+        """
+        arguments = context.args
+        if arguments[:1] == ["dataset"]:
+            hand_over("graderd.simulator.dataset", arguments[1:])
+        else:
+            hand_over("graderd.simulator", arguments)
+
+
+def _demo(app: typer.Typer) -> None:
+
+    @app.command(epilog=example("graderd demo", "graderd demo --json"))
+    def demo(json: Json = False) -> None:
+        """Show the whole loop on a simulated grader.
+
+        It is armed and drives over soil left, center, right and even; the command ends by itself.
+        """
+        hand_over("graderd.simulator.demo", ["--json"] if json else [])

@@ -1,0 +1,138 @@
+"""Faults of the camera and of the pictures. Without a good picture there is nothing to go by: the rotation holds.
+
+What comes and goes by itself (dust, a restart of the worker) lets the rule go on afterwards; what does not, or makes
+all further decisions doubtful, ends automatic operation and leaves the blade to the operator.
+"""
+
+from graderd.core.faults.monitor import FaultRow, Reaction
+
+ROTATION = frozenset({"rotation"})
+NO_AXIS: frozenset[str] = frozenset()
+LENS = "clean the lens, look for what stands before it"
+
+ROWS = (
+    FaultRow(
+        "camera.missing",
+        "there is no camera",
+        "its cable is pulled, it has no power, or the configuration names another one",
+        "check the cable and [camera] serial_number; then 'graderd auto' again",
+        Reaction.RETREAT,
+        axes=NO_AXIS,
+    ),
+    FaultRow(
+        "camera.stale",
+        "the camera has stopped sending pictures",
+        "a loose cable, a USB port that fell asleep, or a camera that hangs",
+        "wait: the camera is restarted by itself; check its cable if that does not help",
+        Reaction.HOLD,
+        axes=ROTATION,
+        automatic_only=True,
+    ),
+    FaultRow(
+        "camera.black",
+        "the picture is black",
+        "no light, a covered lens, or an exposure set too short",
+        f"switch the work light on, {LENS}, look at exposure_us",
+        Reaction.HOLD,
+        debounce_s=0.1,
+        axes=ROTATION,
+        automatic_only=True,
+    ),
+    FaultRow(
+        "camera.blown_out",
+        "the picture is too bright to see anything",
+        "the sun or a lamp shines into the lens, or the exposure is set too long",
+        "shade the lens, look at exposure_us",
+        Reaction.HOLD,
+        debounce_s=0.1,
+        axes=ROTATION,
+        automatic_only=True,
+    ),
+    FaultRow(
+        "camera.blocked",
+        "something covers the lens",
+        "mud, dust, a leaf or a hand on it",
+        LENS,
+        Reaction.HOLD,
+        debounce_s=0.1,
+        axes=ROTATION,
+        automatic_only=True,
+    ),
+    FaultRow(
+        "camera.frozen",
+        "the camera sends the same picture again and again",
+        "the camera hangs",
+        "pull and plug its cable if it does not go away by itself",
+        Reaction.HOLD,
+        axes=ROTATION,
+        automatic_only=True,
+    ),
+    FaultRow(
+        "camera.blurred",
+        "the picture is blurred",
+        "a dirty or wet lens, or strong shaking",
+        f"{LENS}; check the camera's mount",
+        Reaction.HOLD,
+        debounce_s=0.5,
+        axes=ROTATION,
+        automatic_only=True,
+    ),
+    FaultRow(
+        "camera.torn",
+        "colour and depth do not belong to the same moment",
+        "a USB connection that loses data, or a computer that is too busy",
+        "use a USB 3 port and a short cable",
+        Reaction.HOLD,
+        debounce_s=0.3,
+        axes=ROTATION,
+        automatic_only=True,
+    ),
+    FaultRow(
+        "camera.wrong_resolution",
+        "the picture has another size than the camera was calibrated at",
+        "the [camera] settings were changed, or a USB 2 port allows no larger picture",
+        "set the calibrated size, use a USB 3 port, or calibrate again with 'graderd calibrate camera'",
+        Reaction.RETREAT,
+        axes=NO_AXIS,
+    ),
+    FaultRow(
+        "camera.knocked",
+        "the camera no longer looks where it was calibrated",
+        "its mount was hit or has come loose",
+        "fix the mount and calibrate again with 'graderd calibrate camera'; then 'graderd auto' again",
+        Reaction.RETREAT,
+        debounce_s=1.0,
+        axes=NO_AXIS,
+    ),
+    FaultRow(
+        "camera.depth_missing",
+        "the camera gives no depth, or too little",
+        "direct sun, a shiny or wet blade, or a stream that has stopped",
+        "shade the blade, paint it matt; pull and plug the camera if it stays",
+        Reaction.HOLD,
+        debounce_s=0.5,
+        axes=ROTATION,
+        automatic_only=True,
+    ),
+    FaultRow(
+        "camera.worker_restarted",
+        "the program that reads the camera ended and was started again",
+        "a fault in the camera's driver, or too little memory",
+        "nothing, if it happens seldom; else report it with the daemon's log",
+        Reaction.WARN,
+    ),
+    FaultRow(
+        "camera.worker_hung",
+        "the program that reads the camera hung; it was killed and started again",
+        "the camera's driver hangs, often after a USB disturbance",
+        "check the camera's cable and port; report it with the daemon's log if it comes back",
+        Reaction.WARN,
+    ),
+    FaultRow(
+        "camera.settings_not_kept",
+        "the camera did not take a setting",
+        "the value is outside its range, or another setting overrules it",
+        "see 'graderd status --json' for what it took; correct the [camera] section",
+        Reaction.WARN,
+    ),
+)

@@ -1,0 +1,223 @@
+"""The perception child: owns the camera, judges every frame, can be killed at any moment without harm.
+
+Run by the daemon as ``python -m graderd.runtime.app.perception_child``; speaks ``worker_protocol`` on stdin and stdout.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import queue
+import sys
+import threading
+import time
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+import cv2
+from pydantic import BaseModel, ValidationError
+
+from graderd.hal.camera import Camera, EndOfFrames, Frame, Intrinsics
+from graderd.hal.errors import DeviceError, DeviceTimeoutError
+from graderd.hal.settings import CameraSettings
+from graderd.perception.classifier import Classifier, judge_frame, make_classifier
+from graderd.perception.frame_set import Entry, FrameSetWriter
+from graderd.perception.settings import CameraCalibration, StreamCalibration
+from graderd.runtime.app.frame_sources import open_camera
+from graderd.runtime.perception_protocol import (
+    Angle,
+    CameraProblem,
+    Observed,
+    Opened,
+    Preview,
+    Saved,
+    SaveFrame,
+    Start,
+    ToChild,
+)
+
+JPEG_QUALITY = 80
+OpenSource = Callable[[CameraSettings], Camera]
+
+
+class AngleHistory:
+    """The last second or two of measured blade angles, to know the angle at the moment of exposure."""
+
+    def __init__(self, length_n: int = 128) -> None:
+        self._samples: deque[tuple[float, float]] = deque(maxlen=length_n)
+
+    def add(self, time_s: float, angle_deg: float) -> None:
+        """Append a sample; an older or equal time than the newest is ignored."""
+        if not self._samples or time_s > self._samples[-1][0]:
+            self._samples.append((time_s, angle_deg))
+
+    def at(self, time_s: float) -> tuple[float, float]:
+        """Angle at ``time_s`` (interpolated) and the age of what it rests on; no sample at all is infinitely old."""
+        samples = list(self._samples)
+        if not samples:
+            return 0.0, float("inf")
+        after = bisect_left(samples, (time_s, float("-inf")))
+        if after == len(samples):
+            newest_s, angle_deg = samples[-1]
+            return angle_deg, time_s - newest_s
+        if after == 0:
+            oldest_s, angle_deg = samples[0]
+            return angle_deg, oldest_s - time_s
+        (t0, a0), (t1, a1) = samples[after - 1], samples[after]
+        share = (time_s - t0) / (t1 - t0)
+        return a0 + share * (a1 - a0), min(time_s - t0, t1 - time_s)
+
+
+class Worker:
+    """The child's two threads: one reads the daemon's lines, the main one reads the camera."""
+
+    def __init__(self, start: Start, lines: BinaryIO, out: BinaryIO, open_source: OpenSource = open_camera) -> None:
+        self._start = start
+        self._open_source = open_source
+        self._lines = lines
+        self._out = out
+        self._angles = AngleHistory()
+        self._preview_wanted = threading.Event()
+        self._to_save: queue.SimpleQueue[SaveFrame] = queue.SimpleQueue()
+        self._writers: dict[str, FrameSetWriter] = {}
+
+    def _send(self, message: BaseModel) -> None:
+        self._out.write(message.model_dump_json().encode() + b"\n")
+        self._out.flush()
+
+    def _listen(self) -> None:
+        """Until the daemon's end of the pipe closes; then the process goes at once, hung library call or not."""
+        for line in self._lines:
+            message = ToChild.validate_json(line)
+            if isinstance(message, Angle):
+                self._angles.add(message.time_s, message.angle_deg)
+            elif isinstance(message, SaveFrame):
+                self._to_save.put(message)
+            else:
+                self._preview_wanted.set()
+        os._exit(0)
+
+    def run(self) -> int:
+        """Open the camera, judge frames until something ends it. Returns the exit status."""
+        threading.Thread(target=self._listen, name="daemon-lines", daemon=True).start()
+        settings = self._start.camera
+        try:
+            camera = self._open_source(settings)
+            if self._start.reset_first:
+                camera.reset_hardware()
+            camera.open()
+        except DeviceError as error:
+            self._send(CameraProblem(condition="missing", message=str(error), final=True))
+            return 4
+        read_back = camera.settings_read_back()
+        self._send(
+            Opened(
+                description=camera.description,
+                settings_read_back=read_back,
+                not_kept=settings_not_kept(settings, read_back),
+            )
+        )
+        classifier = make_classifier(
+            self._start.perception, self._start.calibration, self._start.blade, camera=settings
+        )
+        try:
+            return self._judge(camera, classifier)
+        finally:
+            camera.close()
+
+    def _judge(self, camera: Camera, classifier: Classifier) -> int:
+        while True:
+            try:
+                frame = camera.read(self._start.camera.stale_s)
+            except DeviceTimeoutError as error:
+                self._send(CameraProblem(condition="stale", message=str(error)))
+                continue
+            except EndOfFrames:
+                self._send(CameraProblem(condition="missing", message="the recording came to its end", final=True))
+                return 0
+            except DeviceError as error:
+                self._send(CameraProblem(condition="missing", message=str(error), final=True))
+                return 3
+            angle_deg, age_s = self._angles.at(frame.capture_s)
+            observation = judge_frame(
+                classifier, frame, angle_deg, age_s, time.monotonic(), self._start.perception.decision
+            )
+            self._send(Observed.of(observation))
+            if not self._to_save.empty():
+                self._save(self._to_save.get(), frame)
+            if self._preview_wanted.is_set():
+                self._preview_wanted.clear()
+                self._send(Preview(jpeg_base64=_jpeg(classifier, frame, observation)))
+
+    def _save(self, wanted: SaveFrame, frame: Frame) -> None:
+        problem = ""
+        try:
+            if wanted.folder not in self._writers:
+                calibration = with_lens_of(frame, self._start.calibration)
+                self._writers[wanted.folder] = FrameSetWriter(Path(wanted.folder), calibration, self._start.blade)
+            self._writers[wanted.folder].add(Entry(wanted.id, None, wanted.blade_angle_deg), frame)
+        except OSError as error:
+            problem = f"{wanted.folder}: {error.strerror}"
+        self._send(Saved(id=wanted.id, problem=problem))
+
+
+def _jpeg(classifier: Classifier, frame: Frame, observation: object) -> str:
+    picture = classifier.annotate(frame, observation)  # type: ignore[arg-type]  # same observation as just made
+    ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return base64.b64encode(data.tobytes()).decode() if ok else ""
+
+
+def with_lens_of(frame: Frame, calibration: CameraCalibration) -> CameraCalibration:
+    """The calibration's poses with the lens data the frame came with, where it has them."""
+
+    def lens(stream: StreamCalibration, told: Intrinsics | None) -> StreamCalibration:
+        if told is None:
+            return stream
+        changes = {
+            "width_px": told.width,
+            "height_px": told.height,
+            "fx_px": told.fx,
+            "fy_px": told.fy,
+            "cx_px": told.cx,
+            "cy_px": told.cy,
+            "distortion_n": told.coeffs,
+        }
+        return stream.model_copy(update=changes)
+
+    changes = {
+        "color": lens(calibration.color, frame.color_intrinsics),
+        "depth": lens(calibration.depth, frame.depth_intrinsics),
+    }
+    return calibration.model_copy(update=changes)
+
+
+def settings_not_kept(settings: CameraSettings, read_back: dict[str, float]) -> tuple[str, ...]:
+    """Settings whose read-back value is more than 5 % off what was asked for."""
+    wrong = []
+    for name in ("exposure_us", "gain", "white_balance_k"):
+        wanted = getattr(settings, name)
+        got = read_back.get(name)
+        if wanted is not None and got is not None and abs(got - wanted) > 0.05 * wanted:
+            wrong.append(f"{name}: asked {wanted:g}, device says {got:g}")
+    return tuple(wrong)
+
+
+def main(open_source: OpenSource = open_camera) -> int:
+    """Body of the child process; ``open_source`` makes the camera of the daemon's settings. Returns the exit status."""
+    cv2.setNumThreads(1)  # one core is the control loop's
+    # A camera library that prints must not be able to spoil the protocol: its stdout becomes stderr.
+    out = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    try:
+        start = Start.model_validate_json(sys.stdin.buffer.readline())
+    except ValidationError as error:
+        sys.stderr.write(f"graderd worker: not started by the daemon: {error.errors()[0]['msg']}\n")
+        return 2
+    return Worker(start, sys.stdin.buffer, out, open_source).run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,130 @@
+"""What the daemon and its perception child say to each other: one JSON object a line, both ways.
+
+To the child: first a :class:`Start`, then ``Angle`` at the control rate, ``PreviewRequest`` when someone looks,
+``SaveFrame`` while calibrating. From the child: ``Opened``, ``Observed`` for every frame, ``CameraProblem``,
+``Preview``, ``Saved``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from graderd.core.blade import BladeGeometry
+from graderd.core.soil import SoilObservation
+from graderd.hal.settings import CameraSettings
+from graderd.perception.settings import CameraCalibration, PerceptionSettings
+
+_OBSERVATION: TypeAdapter[SoilObservation] = TypeAdapter(SoilObservation)
+
+
+class _Message(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Start(_Message):
+    """Everything the child needs to know."""
+
+    kind: Literal["start"] = "start"
+    camera: CameraSettings
+    calibration: CameraCalibration
+    perception: PerceptionSettings
+    blade: BladeGeometry
+    reset_first: bool = False
+
+
+class Angle(_Message):
+    """The measured blade angle and its monotonic time."""
+
+    kind: Literal["angle"] = "angle"
+    angle_deg: float
+    time_s: float
+
+
+class PreviewRequest(_Message):
+    """Send the next frame's annotated picture."""
+
+    kind: Literal["preview"] = "preview"
+
+
+class SaveFrame(_Message):
+    """Add the next frame to the frame set in ``folder``, taken at ``blade_angle_deg``."""
+
+    kind: Literal["save_frame"] = "save_frame"
+    folder: str
+    id: str
+    blade_angle_deg: float
+
+
+class Saved(_Message):
+    """A frame was saved; ``problem`` says why not, where it could not."""
+
+    kind: Literal["saved"] = "saved"
+    id: str
+    problem: str = ""
+
+
+class Opened(_Message):
+    """The camera is open."""
+
+    kind: Literal["opened"] = "opened"
+    description: str
+    settings_read_back: dict[str, float]
+    not_kept: tuple[str, ...] = ()
+
+
+class Observed(_Message):
+    """One frame was judged; ``observation`` as :class:`SoilObservation`'s fields."""
+
+    kind: Literal["observed"] = "observed"
+    observation: dict[str, Any]
+
+    @classmethod
+    def of(cls, observation: SoilObservation) -> Observed:
+        """Pack an observation."""
+        return cls(observation=asdict(observation))
+
+    def unpack(self) -> SoilObservation:
+        """The observation again.
+
+        Raises:
+            ValueError: a field is missing, unknown, of another type, or a number that cannot be.
+        """
+        try:
+            observation = _OBSERVATION.validate_python(self.observation)
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        shares = (observation.share_left, observation.share_center, observation.share_right)
+        if not 0.0 <= observation.confidence <= 1.0 or not all(0.0 <= share <= 1.0 for share in shares):
+            raise ValueError(f"confidence {observation.confidence} or shares {shares} are not between 0 and 1")
+        if not math.isfinite(observation.capture_s):
+            raise ValueError(f"capture_s is {observation.capture_s}")
+        return observation
+
+
+class CameraProblem(_Message):
+    """No frame now; ``condition`` is a row of the fault catalogue's camera part. ``final``: the child gives up."""
+
+    kind: Literal["problem"] = "problem"
+    condition: str
+    message: str
+    final: bool = False
+
+
+class Preview(_Message):
+    """An annotated picture, JPEG, base64."""
+
+    kind: Literal["preview"] = "preview"
+    jpeg_base64: str
+
+
+ToChild = TypeAdapter[Angle | PreviewRequest | SaveFrame](
+    Annotated[Angle | PreviewRequest | SaveFrame, Field(discriminator="kind")]
+)
+FromChild = TypeAdapter[Opened | Observed | CameraProblem | Preview | Saved](
+    Annotated[Opened | Observed | CameraProblem | Preview | Saved, Field(discriminator="kind")]
+)
