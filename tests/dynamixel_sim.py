@@ -110,7 +110,7 @@ async def bench(
     servo = servo or VirtualServo()
     clock = AwakeClock()
     bus = VirtualServoBus([servo], folder / "servo", clock=clock, **(wire or {}))
-    brisk = {"velocity_deg_per_s": 60.0, "acceleration_deg_per_s2": 240.0}  # so that tests need not wait for the blade
+    brisk = {"speed_deg_per_s": 50.0, "acceleration_deg_per_s2": 200.0}  # so that tests need not wait for the blade
     settings = RotatorSettings(**{"port": str(folder / "servo"), **brisk, **changes})
     rotator = Ph54Rotator(settings, clock=clock)
     await bus.start()

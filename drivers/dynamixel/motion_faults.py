@@ -98,7 +98,7 @@ class MotionDetectors:
 
     def _duration_s(self, way_deg: float, speed_deg_per_s: float) -> float:
         """How long the profile takes for a way, braking from a speed in the wrong direction first."""
-        top, acceleration = self._settings.velocity_deg_per_s, self._settings.acceleration_deg_per_s2
+        top, acceleration = self._settings.profile_velocity_deg_per_s, self._settings.profile_acceleration_deg_per_s2
         way_deg += speed_deg_per_s**2 / acceleration
         if way_deg < top**2 / acceleration:
             move_s = 2 * math.sqrt(way_deg / acceleration)
@@ -107,9 +107,9 @@ class MotionDetectors:
         return move_s + speed_deg_per_s / acceleration
 
     def _watch_stuck(self, s: Sample, goal_deg: float) -> None:
-        arrived = abs(goal_deg - s.angle_deg) <= self._settings.in_position_deg
+        arrived = abs(goal_deg - s.angle_deg) <= self._settings.tolerance_deg
         st = self._settings
-        progress_deg = min(_MOVED_DEG, 0.3 * st.velocity_deg_per_s * st.not_moving_s)
+        progress_deg = min(_MOVED_DEG, 0.3 * st.profile_velocity_deg_per_s * st.not_moving_s)
         if arrived or abs(s.angle_deg - self._progress_deg) > progress_deg:
             self._progress_deg, self._progress_s = s.angle_deg, s.time_s
         stuck_s = s.time_s - self._progress_s
@@ -120,19 +120,19 @@ class MotionDetectors:
     def _watch_direction(self, s: Sample, goal_deg: float) -> None:
         error_deg = goal_deg - s.angle_deg
         opposed = error_deg * s.velocity_deg_per_s < 0 and abs(s.velocity_deg_per_s) > _STILL_DEG_PER_S
-        if not opposed or abs(error_deg) <= self._settings.in_position_deg:
+        if not opposed or abs(error_deg) <= self._settings.tolerance_deg:
             self._opposed_since_s = None
             return
         if self._opposed_since_s is None:
             self._opposed_since_s, self._opposed_from_deg = s.time_s, s.angle_deg
             # A goal behind a moving blade is legal: it must be given the time to brake.
-            stopping_s = abs(s.velocity_deg_per_s) / self._settings.acceleration_deg_per_s2
+            stopping_s = abs(s.velocity_deg_per_s) / self._settings.profile_acceleration_deg_per_s2
             self._opposed_allowed_s = 1.2 * stopping_s + _WRONG_WAY_S
         lasted_s = s.time_s - self._opposed_since_s
         away_deg = abs(s.angle_deg - self._opposed_from_deg)
         # No permitted speed takes so far to brake: a runaway is not given the time that braking would take.
         st = self._settings
-        most_deg = 1.5 * st.velocity_deg_per_s**2 / (2.0 * st.acceleration_deg_per_s2) + _WRONG_WAY_DEG
+        most_deg = 1.5 * st.profile_velocity_deg_per_s**2 / (2.0 * st.profile_acceleration_deg_per_s2) + _WRONG_WAY_DEG
         if (lasted_s > self._opposed_allowed_s and away_deg > _WRONG_WAY_DEG) or away_deg > most_deg:
             detail = f"turning away from the goal for {lasted_s:.2f} s ({away_deg:.1f}°), {error_deg:+.1f}° to go"
             self._note(s, "wrong_way", detail)
@@ -151,7 +151,7 @@ class MotionDetectors:
                 self._rest_deg, self._rest_since_s = s.angle_deg, s.time_s
             return
         moved_deg = s.angle_deg - self._rest_deg
-        if abs(moved_deg) <= self._settings.in_position_deg:
+        if abs(moved_deg) <= self._settings.tolerance_deg:
             return
         if not still:
             self._note(

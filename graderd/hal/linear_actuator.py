@@ -29,6 +29,11 @@ class ActuatorTelemetry:
     thermal_load: float = 0.0
     counters: dict[str, int] = field(default_factory=dict)
 
+    @property
+    def position(self) -> Reading[float] | None:
+        """The extension, by the name that every axis has for it."""
+        return self.position_mm
+
 
 class LinearActuator(Protocol):
     """One linear axis. All methods belong to one event loop; the sync ones never wait."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from graderd.hal.errors import DeviceError
@@ -17,7 +17,9 @@ from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.rotator import Rotator
 
-ACTUATOR_NAMES = ("lift_left", "lift_right", "tilt")
+RETRY_S = 1.0
+
+log = logging.getLogger(__name__)
 
 
 class Link(Protocol):
@@ -59,12 +61,18 @@ class Devices:
     publish_faults: Callable[[tuple[DeviceFault, ...], bool], None] = _publish_nowhere
     """Puts the active faults, and whether the machine is stopped, on the bus as diagnostic messages (DM1)."""
     watch_bus: Callable[[Callable[[str], None]], Callable[[], None]] = _watch_nothing
-    """Calls a listener with every frame on the bus, received or sent, as a line of candump text; returns the call that
-    ends it."""
+    """Calls a listener with every frame on the bus, received or sent, as a line of candump text; returns the call
+    that ends it."""
+    problems: dict[str, str] = field(default_factory=dict)
+    """Why a device, or the bus (``can``), is not open yet; kept by :func:`open_devices`."""
 
     def all(self) -> dict[str, Rotator | LinearActuator]:
         """The axes by device name."""
         return {"rotation": self.rotation, **self.actuators}
+
+    def problem_of(self, axis: str) -> str:
+        """Why the axis's device is not open, empty where nothing is known. An actuator waits for its bus."""
+        return self.problems.get(axis, "") or (self.problems.get("can", "") if axis in self.actuators else "")
 
     def hold_all(self) -> tuple[str, ...]:
         """Ask every axis to stop where it is, each in its own try; returns the axes whose driver raised."""
@@ -75,9 +83,6 @@ class Devices:
             except Exception:  # the stop path goes on to the next device whatever this one raised
                 failed.append(name)
         return tuple(failed)
-
-
-log = logging.getLogger(__name__)
 
 
 class PowerSequencer:
@@ -151,26 +156,18 @@ async def _finished(task: asyncio.Task[None] | None) -> None:
         await asyncio.gather(task, return_exceptions=True)
 
 
-RETRY_S = 1.0
-
-log = logging.getLogger(__name__)
-
-
-async def open_devices(devices: Devices, problems: dict[str, str]) -> None:
-    """Open the bus, then all axes side by side; every failure is told once per cause and tried again.
-
-    ``problems``: why a device is not open yet, by name; kept up to date here.
-    """
+async def open_devices(devices: Devices) -> None:
+    """Open the bus, then all axes side by side; every failure is told once per cause and tried again."""
     async with asyncio.TaskGroup() as group:
-        group.create_task(_keep_trying("rotation", devices.rotation.open, problems), name="open-rotation")
-        group.create_task(_open_bus(devices, problems), name="open-can")
+        group.create_task(_keep_trying("rotation", devices.rotation.open, devices.problems), name="open-rotation")
+        group.create_task(_open_bus(devices), name="open-can")
 
 
-async def _open_bus(devices: Devices, problems: dict[str, str]) -> None:
-    await _keep_trying("can", devices.link.open, problems)
+async def _open_bus(devices: Devices) -> None:
+    await _keep_trying("can", devices.link.open, devices.problems)
     async with asyncio.TaskGroup() as group:
         for name, actuator in devices.actuators.items():
-            group.create_task(_keep_trying(name, actuator.open, problems), name=f"open-{name}")
+            group.create_task(_keep_trying(name, actuator.open, devices.problems), name=f"open-{name}")
 
 
 async def _keep_trying(name: str, open_device: Callable[[], Awaitable[None]], problems: dict[str, str]) -> None:

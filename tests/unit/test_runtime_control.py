@@ -39,7 +39,7 @@ class Bench:
             if zone is not None and index % 3 == 0:
                 now_s = self.machine.clock.now_s()
                 self.machine.eyes.next = SoilObservation(now_s, zone, 0.9, "", **shares)
-            self.loop.tick()
+            self.loop.turn()
             for _ in range(4):
                 await asyncio.sleep(0)  # the power keeper's task takes its turns
 
@@ -56,7 +56,7 @@ class Bench:
     async def arm(self) -> None:
         assert (await self.do(cmd.Arm(client="t"))).accepted
         await self.ticks(4)
-        assert self.loop.state.mode is Mode.MANUAL
+        assert self.loop.tick.state.mode is Mode.MANUAL
 
 
 @pytest.fixture
@@ -106,7 +106,7 @@ async def test_stop_holds_every_axis_before_it_returns_and_latches(bench: Bench,
     assert {line for line in bench.machine.log if "hold" in line} == {
         "rotation hold", "lift_left hold", "lift_right hold", "tilt hold"
     }  # fmt: skip
-    assert bench.loop.state.mode is Mode.STOPPED
+    assert bench.loop.tick.state.mode is Mode.STOPPED
     bench.machine.log.clear()
     await bench.ticks(20)
     assert not any("goal" in line for line in bench.machine.log)
@@ -181,8 +181,8 @@ async def test_a_device_that_refuses_arming_leaves_the_machine_disarmed_with_the
     bench.machine.tilt.refuse_arm = DeviceRefusedError("tilt", "limits did not read back", "check the profile")
     await bench.do(cmd.Arm(client="t"))
     await bench.ticks(10)
-    assert bench.loop.state.mode is Mode.DISARMED
-    assert "limits did not read back" in bench.loop.state.reason
+    assert bench.loop.tick.state.mode is Mode.DISARMED
+    assert "limits did not read back" in bench.loop.tick.state.reason
     assert all(d.lifecycle is Lifecycle.STANDBY for d in bench.machine.devices.all().values())
 
 
@@ -190,10 +190,10 @@ async def test_a_lost_device_disarms_and_needs_a_new_arm(bench: Bench) -> None:
     await bench.arm()
     bench.machine.rotation.lifecycle = Lifecycle.FAILED
     await bench.ticks(3)
-    assert bench.loop.state.mode is Mode.DISARMED
+    assert bench.loop.tick.state.mode is Mode.DISARMED
     bench.machine.rotation.lifecycle = Lifecycle.STANDBY
     await bench.ticks(50)
-    assert bench.loop.state.mode is Mode.DISARMED
+    assert bench.loop.tick.state.mode is Mode.DISARMED
 
 
 async def test_a_driver_that_refuses_a_goal_makes_the_axis_hold_and_says_why(bench: Bench) -> None:
@@ -201,8 +201,8 @@ async def test_a_driver_that_refuses_a_goal_makes_the_axis_hold_and_says_why(ben
     bench.machine.rotation.refuse_goal = DeviceRefusedError("rotation", "soft limit")
     await bench.do(cmd.Jog(axis="rotate", value=10.0, client="t"))
     await bench.ticks(2)
-    assert bench.loop.passed["rotation"].limited is None
-    assert "soft limit" in bench.loop.passed["rotation"].reason
+    assert bench.loop.tick.axes["rotation"].limited is None
+    assert "soft limit" in bench.loop.tick.axes["rotation"].because
 
 
 async def test_an_unknown_condition_of_a_driver_stops_the_machine(bench: Bench) -> None:
@@ -210,13 +210,13 @@ async def test_an_unknown_condition_of_a_driver_stops_the_machine(bench: Bench) 
     fault = DeviceFault("rotation", "something_new", "42", bench.machine.clock.now_s())
     bench.machine.rotation.present.append(fault)
     await bench.ticks(2)
-    assert bench.loop.state.mode is Mode.STOPPED
+    assert bench.loop.tick.state.mode is Mode.STOPPED
     refused = await bench.do(cmd.Reset(client="t"))
     assert not refused.accepted
     bench.machine.rotation.present.clear()
     await bench.ticks(1)
     assert (await bench.do(cmd.Reset(client="t"))).accepted
-    assert bench.loop.faults.active == ()
+    assert bench.loop.tick.faults == ()
 
 
 async def test_the_measured_angle_goes_to_perception_every_tick(bench: Bench) -> None:
