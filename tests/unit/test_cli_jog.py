@@ -129,7 +129,15 @@ async def test_refused_jogs_move_nothing(
 
 def lifts(time_s: float, limited: float | None, *faults: str) -> dict[str, Any]:
     """What the stream says of two lifts on their way to 130 mm."""
-    axis = {"unit": "mm", "measured": 110.0, "requested": 130.0, "limited": limited, "limited_because": "", "moving": 0}
+    axis = {
+        "unit": "mm",
+        "limited_because": "",
+        "measured": 110.0,
+        "requested": 130.0,
+        "limited": limited,
+        "arrived": False,
+        "moving": 0,
+    }
     axes = {name: {"name": name, **axis} for name in ("lift_left", "lift_right")}
     present = [
         {"name": n, "present": True, "detail": "7.7 mm apart", "reads": "", "remedy": "level it"} for n in faults
