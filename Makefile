@@ -36,7 +36,7 @@ LOG    := $(VENV)/set-up.log
 define because
 { cat $(LOG) >&2; case "$$(cat $(LOG))" in \
 *"DO NOT MATCH THE HASHES"* | *"Hash mismatch"*) why="a file is not the one that requirements.lock names: broken on its way, or changed on the index; empty the cache (pip cache purge, uv cache clean) and make again, and if it stays, take another index" ;; \
-*[Cc]onnect* | *"timed out"* | *resolving*) why="the package index is not reached; look at the network, HTTPS_PROXY and PIP_INDEX_URL (UV_DEFAULT_INDEX for uv), then make again" ;; \
+*[Cc]onnect* | *"timed out"* | *"dns error"*) why="the package index is not reached; look at the network, HTTPS_PROXY and PIP_INDEX_URL (UV_DEFAULT_INDEX for uv), then make again" ;; \
 *"No space left"*) why="the disk is full; make room (300 MB to download, 1 GB in $(VENV)), then make again" ;; \
 *"No matching distribution"* | *"No solution found"*) why="the index has no wheel of a pinned version for this Python on this machine; README says which have all (make PYTHON=/path/to/python3), or the index is not a whole one" ;; \
 *) why="the cause stands above" ;; \
