@@ -14,9 +14,13 @@ DEB_ARGS ?=
 HIL_ARGS ?=
 BENCH_ARGS ?=
 LOCK_ARGS ?=
+PYTHONS ?= 3.11 3.12 3.13
+PYTHON_TARGETS ?= run test
+# Any that is there; pyenv's names on PATH start only the version that PYENV_VERSION names.
+FIND_PYTHON = PYENV_VERSION=$* $(BIN)/uv python find --system --no-python-downloads
 SOAK_S ?= 900
 
-.PHONY: help run test faults deb hil soak soak-virtual-time hil-package hil-arm64 hil-usb bench-hw check format lock clean
+.PHONY: help run test quick test-pythons faults deb hil soak soak-virtual-time hil-package hil-arm64 hil-usb bench-hw check format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
@@ -65,6 +69,16 @@ run: $(STAMP) ## drive the demonstration on the simulated grader (ARGS=--json fo
 test: $(STAMP) ## run the tests
 	@$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not serial_only" $(PYTEST_ARGS)
 	@$(BIN)/python -m pytest -m serial_only $(PYTEST_ARGS)
+
+quick: $(STAMP) ## run the tests of functions, contracts and wires that take no ten seconds each
+	@$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not serial_only and not slow" $(PYTEST_ARGS) tests/unit tests/contract tests/wire
+
+test-pythons: $(PYTHONS:%=test-python-%) ## both commands on each Python that README names, one after the other
+
+test-python-%: $(STAMP)
+	@python=$$($(FIND_PYTHON) $* 2>/dev/null || { $(BIN)/uv python install --quiet $* >&2 && $(FIND_PYTHON) $*; }) \
+	|| { echo "test-pythons: no Python $* on this machine, nor can uv download one; install it, or PYTHONS=\"...\" for the others" >&2; exit 1; }; \
+	$(MAKE) --no-print-directory VENV=.venv-$* PYTHON=$$python $(PYTHON_TARGETS)
 
 faults: $(STAMP) ## inject every fault in every phase of work (ARGS="--short --json" for a part of it)
 	@$(BIN)/python -m tests.fault.campaign $(ARGS)
@@ -126,4 +140,4 @@ lock: $(LOCKED) ## pin what pyproject.toml names; pins in force stay (LOCK_ARGS=
 	@$(BIN)/uv pip compile --universal --python-version 3.11 --all-extras --generate-hashes --custom-compile-command "make lock" --quiet --output-file requirements.lock $(LOCK_ARGS) pyproject.toml
 
 clean: ## remove what the targets above made
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(PYTHONS:%=.venv-%) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
