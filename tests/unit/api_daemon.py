@@ -114,9 +114,6 @@ class FakeDaemon:
             if arguments.get("consent") is not True:
                 raise ServiceError("a reboot lets the blade turn freely for a moment", "send consent: true")
             return {"rebooted": True}
-        if name == "slow":
-            await asyncio.sleep(float(arguments["seconds"]))
-            return {}
         raise ServiceError(f"there is no service {name}", "see /v1/openapi.json")
 
     def _tick(self, now_s: float) -> None:
