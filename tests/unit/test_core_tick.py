@@ -21,6 +21,7 @@ from pydantic import TypeAdapter
 import graderd
 from graderd.config import Config
 from graderd.core import commands as cmd
+from graderd.core import readiness
 from graderd.core.axes import ACTUATORS, AXES
 from graderd.core.machine import Mode
 from graderd.core.soil import SoilObservation, Zone
@@ -182,7 +183,7 @@ async def test_each_device_is_asked_once_a_tick_and_readiness_is_made_once(
 
     for name, device in machine.devices.all().items():
         monkeypatch.setattr(device, "telemetry", count(name, device.telemetry))
-    monkeypatch.setattr("graderd.core.tick.requirements", count("requirements", graderd.core.tick.requirements))
+    monkeypatch.setattr("graderd.core.tick.requirements", count("requirements", readiness.requirements))
     loop.turn()
     assert asked == Counter({**dict.fromkeys(AXES, 1), "requirements": 1})
     await loop._power.close()
