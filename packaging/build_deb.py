@@ -5,16 +5,17 @@ the system's python3: ``lib/common`` holds what every Python takes, ``lib/python
 packages of each supported Python. So one package serves Debian 12 (3.11), Ubuntu 24.04 (3.12) and Debian 13 (3.13).
 Nothing is compiled: every dependency comes as a wheel named in requirements.lock with its hash, which is also why an
 arm64 package can be built on any machine.
+
+The package is a function of the sources: two builds of a commit are the same file, whoever makes them, where and when.
+Its time stamps are $SOURCE_DATE_EPOCH, or the commit's.
 """
 
 from __future__ import annotations
 
 import argparse
-import compileall
 import gzip
 import hashlib
 import os
-import py_compile
 import shutil
 import subprocess
 import sys
@@ -24,9 +25,11 @@ import zipfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 from lock import Pin, Target, read_lock, roots, select
+from notices import copyright_file
 from packaging.utils import canonicalize_name
 
 PROJECT = Path(__file__).resolve().parent.parent
@@ -38,6 +41,8 @@ PREFIX = Path("opt/graderd")
 
 # Folders of dependencies that serve only their own development.
 NOT_SHIPPED = {"tests", "_pyinstaller", "__pyinstaller", "include"}
+# And files: debugging symbols that were split off.
+NOT_SHIPPED_SUFFIX = ".debug"
 
 # Where our own files go: source in the project, place in the package, mode.
 FILES = (
@@ -49,6 +54,7 @@ FILES = (
     ("systemd/udev/70-graderd.rules", "usr/lib/udev/rules.d/70-graderd.rules", 0o644),
     ("systemd/can-link", "usr/lib/graderd/can-link", 0o755),
     ("systemd/adapter-name", "usr/lib/graderd/adapter-name", 0o755),
+    ("packaging/bytecode", "usr/lib/graderd/bytecode", 0o755),
     ("systemd/graderd.env", "usr/share/graderd/default", 0o644),
     ("systemd/adapters", "usr/share/graderd/adapters", 0o644),
     ("systemd/network/70-graderd-can.link", "usr/share/graderd/network/70-graderd-can.link", 0o644),
@@ -57,7 +63,7 @@ FILES = (
     ("systemd/dropins/web-page.conf", "usr/share/graderd/dropins/web-page.conf", 0o644),
     ("systemd/dropins/gpio.conf", "usr/share/graderd/dropins/gpio.conf", 0o644),
     ("systemd/dropins/bind-devices.conf", "usr/share/graderd/dropins/bind-devices.conf", 0o644),
-    ("LICENSE", "usr/share/doc/graderd/copyright", 0o644),
+    ("packaging/debian/lintian-overrides", "usr/share/lintian/overrides/graderd", 0o644),
 )
 
 LAUNCHER = """\
@@ -97,8 +103,30 @@ def run(*command: str | Path, cwd: Path = PROJECT) -> None:
         raise SystemExit(f"build_deb: {' '.join(map(str, command[:6]))}… failed:\n{result.stdout}{result.stderr}")
 
 
+def commit_time_s() -> int:
+    """$SOURCE_DATE_EPOCH, else when the commit was made, in seconds since 1970.
+
+    Raises:
+        SystemExit: neither is known.
+    """
+    said = os.environ.get("SOURCE_DATE_EPOCH")
+    if not said:
+        asked = subprocess.run(
+            ["git", "log", "-1", "--format=%ct"], cwd=PROJECT, capture_output=True, text=True, check=False
+        )
+        said = asked.stdout.strip()
+    if not said.isascii() or not said.isdigit():
+        raise SystemExit(
+            f"build_deb: the time of the package's files is {said!r}, not seconds since 1970. Build in a git checkout, or "
+            "set SOURCE_DATE_EPOCH"
+        )
+    return int(said)
+
+
 def pip(*arguments: str | Path) -> None:
-    """Run this environment's pip."""
+    """Run this environment's pip; an environment that was made without gets the one Python itself brings."""
+    if find_spec("pip") is None:
+        run(sys.executable, "-m", "ensurepip")
     run(sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", *arguments)
 
 
@@ -185,6 +213,8 @@ def unpack(wheel: Path, folder: Path) -> None:
                 if kind not in ("purelib", "platlib") or not rest:
                     continue
                 member.filename = rest
+            if member.filename.endswith(NOT_SHIPPED_SUFFIX):
+                continue
             if not NOT_SHIPPED.intersection(Path(member.filename).parts[1:-1]):
                 archive.extract(member, folder)
 
@@ -217,22 +247,6 @@ def make_environment(package: Package, wheels: dict[str, list[Path]], own: Path)
         launcher = package.prefix / "bin" / name
         launcher.write_text(LAUNCHER.format(module=module, function=function), encoding="utf-8")
         launcher.chmod(0o755)
-
-
-def compile_bytecode(package: Package) -> None:
-    """Byte code for the Python this runs on (the others' is made when the package is configured)."""
-    own = f"{sys.version_info.major}.{sys.version_info.minor}"
-    for folder in ("common", f"python{own}"):
-        path = package.prefix / "lib" / folder
-        if path.exists():
-            compileall.compile_dir(
-                path,
-                quiet=2,
-                workers=0,
-                stripdir=str(package.tree),
-                prependdir="/",
-                invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH,
-            )
 
 
 def place_files(package: Package) -> None:
@@ -295,14 +309,21 @@ def write_control(package: Package) -> None:
         )
     )
     (folder / "control").write_text(control, encoding="utf-8")
-    for name in ("postinst", "prerm", "postrm"):
+    for name, mode in (("postinst", 0o755), ("prerm", 0o755), ("postrm", 0o755), ("triggers", 0o644)):
         shutil.copyfile(DEBIAN / name, folder / name)
-        (folder / name).chmod(0o755)
+        (folder / name).chmod(mode)
     sums = [
         f"{hashlib.md5(path.read_bytes(), usedforsecurity=False).hexdigest()}  {path.relative_to(package.tree)}\n"
         for path in sorted(files)
     ]
     (folder / "md5sums").write_text("".join(sums), encoding="utf-8")
+
+
+def level(tree: Path) -> None:
+    """Give every file the same time, whenever it was written."""
+    time_s = commit_time_s()
+    for path in [tree, *tree.rglob("*")]:
+        os.utime(path, (time_s, time_s), follow_symlinks=False)
 
 
 def system_python() -> str:
@@ -329,14 +350,23 @@ def build(version: str, architecture: str, pythons: tuple[str, ...], folder: Pat
         with ThreadPoolExecutor(thread_name_prefix="beside the download") as pool:
             own = pool.submit(our_wheel, package, scratch)
             placed = pool.submit(place_files, package)
-            make_environment(package, wheels_for(package, scratch), own.result())
+            wheels = wheels_for(package, scratch)
+            make_environment(package, wheels, own.result())
             placed.result()
-        compile_bytecode(package)
+        place_of = {
+            wheel: str(PREFIX / "lib" / ("common" if serves_all(wheel, python) else f"python{python}/site-packages"))
+            for python, files in wheels.items()
+            for wheel in files
+        }
+        notices = package.tree / "usr/share/doc/graderd/copyright"
+        notices.write_text(copyright_file(wheels, place_of), encoding="utf-8")
         run("chmod", "-R", "u+rwX,go+rX,go-w", package.tree)
         write_control(package)
+        level(package.tree)
         result = folder / f"graderd_{version}_{architecture}.deb"
-        # Level 10 takes eight times as long for a file that is a tenth smaller.
-        run("dpkg-deb", "--root-owner-group", "-Zzstd", "-z3", "--build", package.tree, result)
+        # Level 10 takes eight times as long for a file that is a tenth smaller. One thread, for several cut the file in
+        # pieces whose number is the machine's affair.
+        run("dpkg-deb", "--root-owner-group", "--threads-max=1", "-Zzstd", "-z3", "--build", package.tree, result)
     return result
 
 
