@@ -42,10 +42,16 @@ COMMON = (
         r"GNU LESSER GENERAL PUBLIC LICENSE\s+Version 3, 29 June 2007",
         r"permanent authorization for you to choose that version for the\s+Library\.",
     ),
-    ("MPL-2.0", r"Mozilla Public License Version 2\.0\s+=+\s+1\. Definitions", r"Incompatible With Secondary Licenses.{0,200}"),
+    (
+        "MPL-2.0",
+        r"Mozilla Public License Version 2\.0\s+=+\s+1\. Definitions",
+        r"Incompatible With Secondary Licenses.{0,200}",
+    ),
 )
 LICENCE_FILE = re.compile(r"licen[cs]e|copying|notice", re.IGNORECASE)
-COPYRIGHT_LINE = re.compile(r"^\W*(?:portions )?copyright\b.*\d{4}.*$|^\W*\(c\) .*\d{4}.*$", re.IGNORECASE | re.MULTILINE)
+COPYRIGHT_LINE = re.compile(
+    r"^\W*(?:portions )?copyright\b.*\d{4}.*$|^\W*\(c\) .*\d{4}.*$", re.IGNORECASE | re.MULTILINE
+)
 
 
 def copyright_file(wheels: Mapping[str, Iterable[Path]], place_of: Mapping[Path, str]) -> str:
