@@ -120,13 +120,14 @@ def newer_version(package: Path, directory: Path) -> Path:
     substitute(
         config / "migrate.py", "STEPS: Final[Mapping[int, Step]] = {}", f"STEPS: Final[Mapping[int, Step]] = {step}"
     )
+    (tree / "DEBIAN" / "md5sums").unlink()  # dpkg makes its own where a package has none
     result = tree.with_suffix(".deb")
     subprocess.run(["dpkg-deb", "--root-owner-group", "-Zzstd", "-z1", "--build", tree, result], check=True, stdout=-3)
     return result
 
 
 def substitute(source: Path, old: str, new: str) -> None:
-    """Change a module of the package; its byte code, which nobody compares with it, goes.
+    """Change a module of the package.
 
     Raises:
         SystemExit: the text is not there (any more).
@@ -135,8 +136,6 @@ def substitute(source: Path, old: str, new: str) -> None:
     if text.count(old) != 1:
         raise SystemExit(f"hil: {source.name} has no {old!r}: correct hil/package.py")
     source.write_text(text.replace(old, new), encoding="utf-8")
-    for stale in (source.parent / "__pycache__").glob(f"{source.stem}.*.pyc"):
-        stale.unlink()
 
 
 def lint(package: Path) -> None:
