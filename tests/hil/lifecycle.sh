@@ -52,9 +52,18 @@ install "$package" >/tmp/forbidden 2>&1 || fail "$(cat /tmp/forbidden)"
 [ "$(systemctl is-active graderd)" = inactive ] || fail "started against policy-rc.d"
 rm /usr/sbin/policy-rc.d
 
-step "asked for: started at once on the simulated grader"
+step "asked for: started at once on the simulated grader; no device of others is announced anew"
+# Were every network interface announced anew, lo would be.
+echo 'ACTION=="add", RUN+="/bin/sh -c '"'echo %p >>/run/announced'"'"' >/etc/udev/rules.d/99-hil.rules
+udevadm control --reload
+udevadm trigger --action=add --subsystem-match=net && udevadm settle
+grep -q '/lo$' /run/announced || fail "the test does not see what is announced"
+rm /run/announced
 install "$package" >/dev/null
 unset GRADERD_SIM
+udevadm settle
+[ ! -e /run/announced ] || fail "announced anew: $(cat /run/announced)"
+rm /etc/udev/rules.d/99-hil.rules
 until_mode disarmed 60
 step "used: armed, blade turned"
 for attempt in 1 2 3 4; do
