@@ -327,7 +327,7 @@ def write_control(package: Package) -> None:
 
 def level(tree: Path) -> None:
     """Give every file the same time, whenever it was written."""
-    time_s = commit_time_s()
+    time_s = int(os.environ["SOURCE_DATE_EPOCH"])
     for path in [tree, *tree.rglob("*")]:
         os.utime(path, (time_s, time_s), follow_symlinks=False)
 
@@ -353,6 +353,8 @@ def build(version: str, architecture: str, pythons: tuple[str, ...], folder: Pat
         package = Package(version, architecture, pythons, scratch / "tree")
         package.tree.mkdir(mode=0o755)
         os.umask(0o022)
+        # dpkg-deb writes a time of its own, and takes it from here.
+        os.environ["SOURCE_DATE_EPOCH"] = str(commit_time_s())
         with ThreadPoolExecutor(thread_name_prefix="beside the download") as pool:
             own = pool.submit(our_wheel, package, scratch)
             placed = pool.submit(place_files, package)

@@ -62,7 +62,7 @@ cat /dev/zero >/etc/graderd/filler 2>/dev/null || true
 install "$newer" || fail "half-configured by a full disk: $(tail -5 /tmp/said)"
 cmp $config /tmp/former.toml || fail "configuration lost on a full disk"
 grep -q 'not started with it' /tmp/said || fail "nothing told: $(cat /tmp/said)"
-umount /etc/graderd
+umount /etc/graderd && rm -r /tmp/etc
 install "$package" || fail "$(tail -5 /tmp/said)"
 
 step "names planted by the group in a directory that was once its own: root follows none"
