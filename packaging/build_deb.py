@@ -130,9 +130,7 @@ def commit_time_s() -> int:
 
 
 def pip(*arguments: str | Path) -> None:
-    """Run this environment's pip; an environment that was made without gets the one Python itself brings."""
-    if find_spec("pip") is None:
-        run(sys.executable, "-m", "ensurepip")
+    """Run this environment's pip."""
     run(sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", *arguments)
 
 
@@ -348,6 +346,9 @@ def system_python() -> str:
 def build(version: str, architecture: str, pythons: tuple[str, ...], folder: Path, packing: Sequence[str]) -> Path:
     """Build the package into ``folder``, packed as these options of dpkg-deb say; returns its path."""
     folder.mkdir(parents=True, exist_ok=True)
+    if find_spec("pip") is None:
+        # An environment that uv made has none; Python itself brings one.
+        run(sys.executable, "-m", "ensurepip")
     with tempfile.TemporaryDirectory(prefix="graderd-deb-") as temporary:
         scratch = Path(temporary)
         package = Package(version, architecture, pythons, scratch / "tree")
