@@ -21,6 +21,7 @@ from graderd.drivers.electrak.motion_faults import (
 from graderd.drivers.electrak.planner import MotionPlanner
 from graderd.drivers.electrak.profile import load_profile
 from graderd.drivers.electrak.thermal import OverloadPolicy, ThermalGuard, Verdict
+from graderd.drivers.j1939.ids import Frame, Pgn, make_id
 from graderd.drivers.j1939.link import CanLink
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import (
@@ -41,6 +42,9 @@ _SILENCE_S: Final = 1.0
 _WAKING_S: Final = 0.5
 """A claim so soon after our first message of a while is that of a unit which fell asleep meanwhile."""
 _CLOSE_REPEATS_N: Final = 3
+_CONTROL_PRIORITY: Final = 6
+SELECTABLE_ADDRESSES: Final = range(19, 43)
+"""An Electrak's first address is 19 (HD) or 27 (MD), to which its select wires add."""
 
 
 class ElectrakActuator:
@@ -89,6 +93,11 @@ class ElectrakActuator:
     def address(self) -> int:
         """J1939 address of the actuator."""
         return self.settings.address_n
+
+    @property
+    def feedback_pgn(self) -> int:
+        """Group of the actuator feedback message."""
+        return Pgn.PROPRIETARY_A2
 
     @property
     def lifecycle(self) -> Lifecycle:
@@ -234,7 +243,7 @@ class ElectrakActuator:
 
     # -- the link's side --------------------------------------------------------------------------------------------
 
-    def control_data(self, now_s: float) -> bytes:
+    def control_frame(self, source: int, now_s: float) -> Frame:
         """The control message that goes out now."""
         if now_s - self._control_at_s > _SILENCE_S:
             self._resumed_at_s = now_s
@@ -246,7 +255,8 @@ class ElectrakActuator:
             self._sent = Reading(control.target_mm, now_s)
         self._counters["control_n"] += 1
         self._monitor.on_sent(control.motion_enable, self._planner.direction, now_s)
-        return self._codec.encode_control(control)
+        can_id = make_id(_CONTROL_PRIORITY, Pgn.PROPRIETARY_A, source, self.address)
+        return Frame(can_id, self._codec.encode_control(control))
 
     def on_feedback(self, data: bytes, now_s: float) -> None:
         """A feedback message from this address."""
@@ -330,7 +340,7 @@ class ElectrakActuator:
         age_s = now_s - max(self._track.feedback_at_s, self._opened_at_s)
         if age_s > self.settings.feedback_timeout_s:
             self._track.good_n = 0
-            unknown = [a for a in self._link.unknown_feedback_addresses(now_s) if 19 <= a <= 42]
+            unknown = self._strangers(now_s)
             detail = f"no feedback from address {self.address} for {age_s:.2f} s"
             if unknown and self._link.is_open:
                 heard = ", ".join(str(a) for a in unknown)
@@ -349,6 +359,10 @@ class ElectrakActuator:
         load = f"{100 * thermal.load:.0f} % of the heat budget"
         self._faults.keep("thermal_limit", thermal.limited, f"{load}: no motion until it is cooler", now_s)
         self._faults.keep("thermal_derating", thermal.derating and not thermal.limited, f"{load}: rests added", now_s)
+
+    def _strangers(self, now_s: float) -> list[int]:
+        """Addresses within an Electrak's reach that give an Electrak's feedback and belong to no configured axis."""
+        return [a for a in self._link.strangers(self.feedback_pgn, now_s) if a in SELECTABLE_ADDRESSES]
 
     def _fail(self) -> None:
         if self._lifecycle is not Lifecycle.CLOSED and self._lifecycle is not Lifecycle.FAILED:
@@ -392,7 +406,7 @@ class ElectrakActuator:
 
     def _no_feedback_error(self) -> DeviceError:
         now_s = self._clock.now_s()
-        unknown = self._link.unknown_feedback_addresses(now_s)
+        unknown = self._strangers(now_s)
         cause = f"no feedback from address {self.address}"
         remedy = "Check its supply, the 120 ohm terminators and address_n"
         if unknown:

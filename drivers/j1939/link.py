@@ -1,8 +1,8 @@
 """The CAN link: one owner of the bus, its own reader, a steady schedule of control messages, a supervisor.
 
-Several actuators share one :class:`CanLink`. It claims our J1939 address, sends every actuator's control message on
-a fixed 100 ms grid, hands feedback out by source address, tells stop messages, publishes DM1, and opens the bus again
-with back-off when it was lost.
+The drivers of all devices on the bus share one :class:`CanLink`. It claims our J1939 address, sends every device's
+control message on a fixed 100 ms grid, hands feedback out by source address, tells stop messages, publishes DM1, and
+opens the bus again with back-off when it was lost. What is in the messages is the drivers' own.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Final, Protocol
 from graderd.drivers.j1939 import dm1
 from graderd.drivers.j1939.bus_health import BusEvent, BusHealth
 from graderd.drivers.j1939.can_port import BusPort, PortFullError, PortLostError, open_port
-from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
+from graderd.drivers.j1939.ids import GLOBAL, Frame, Pgn, destination_of, pgn_of, source_of
 from graderd.drivers.j1939.name import Name
 from graderd.drivers.j1939.node import Identity, J1939Node
 from graderd.drivers.j1939.stop_message import StopWatcher
@@ -30,19 +30,24 @@ from graderd.hal.settings import CanSettings
 
 
 class LinkUser(Protocol):
-    """What the link wants of an actuator. The methods never wait."""
+    """The driver of one device on the bus, as the link sees it. The methods never wait."""
 
     @property
     def address(self) -> int:
-        """J1939 address of the actuator."""
+        """J1939 address of the device."""
         ...
 
-    def control_data(self, now_s: float) -> bytes:
-        """Content of the control message that goes out now."""
+    @property
+    def feedback_pgn(self) -> int:
+        """Parameter group of the device's feedback, sent to everybody or to us; for as long as it is attached."""
+        ...
+
+    def control_frame(self, source: int, now_s: float) -> Frame:
+        """The control message that goes out now, from our address ``source``."""
         ...
 
     def on_feedback(self, data: bytes, now_s: float) -> None:
-        """A feedback message from this address."""
+        """A message of the feedback group from the device's address."""
         ...
 
     def on_claim(self, name: int, solicited: bool, now_s: float) -> None:
@@ -60,7 +65,7 @@ class LinkUser(Protocol):
 
 _log = logging.getLogger(__name__)
 
-ACM_PERIOD_S: Final = 0.1
+CONTROL_PERIOD_S: Final = 0.1
 _POLL_S: Final = 0.02
 _AHEAD_S: Final = 0.0004
 """Wake-ups come so much before their time: more than waking up and encoding mostly take, so that control messages keep
@@ -68,9 +73,6 @@ their period to some microseconds. What is left of it is spun, ten times a secon
 _BACKOFF_FIRST_S: Final = 0.1
 _BACKOFF_MAX_S: Final = 2.0
 _CLOSE_REPEATS_N: Final = 3
-_ACM_PRIORITY: Final = 6
-_AFM_MASK: Final = 0x03FFFF00
-_AFM_MATCH: Final = 0x01EFFF00
 
 
 @dataclass(slots=True)
@@ -82,7 +84,7 @@ class LinkCounters:
     tx_full_n: int = 0
     lost_n: int = 0
     reopened_n: int = 0
-    acm_late_max_s: float = 0.0
+    control_late_max_s: float = 0.0
 
 
 @dataclass(slots=True)
@@ -92,7 +94,7 @@ class _Taps:
 
 
 class CanLink:
-    """The J1939 bus of the actuators.
+    """The J1939 bus of the machine's devices.
 
     ``on_stop`` is called, with the reason in words, for a stop message (ISO 11783-7 or the configured PGN).
     ``bus_factory`` replaces the opening of ``settings.interface`` (in-process buses of tests). All methods belong to
@@ -122,7 +124,8 @@ class CanLink:
         self._stop = StopWatcher(settings.stop_pgn_n, settings.stop_on_iso11783_all_stop, on_stop)
         self._port: BusPort | None = None
         self._users: dict[int, LinkUser] = {}
-        self._strangers: dict[int, float] = {}
+        self._feedback_pgns: frozenset[int] = frozenset()
+        self._strangers: dict[tuple[int, int], float] = {}
         self._taps = _Taps()
         self._tasks: list[asyncio.Task[None]] = []
         self._lost = asyncio.Event()
@@ -156,9 +159,9 @@ class CanLink:
         self._health.watch_claim(self._node.claimer, now_s)
         return self._health.faults(now_s)
 
-    def unknown_feedback_addresses(self, now_s: float) -> tuple[int, ...]:
-        """Addresses that sent actuator feedback within the last second and belong to no configured actuator."""
-        return tuple(sorted(a for a, t in self._strangers.items() if now_s - t < 1.0))
+    def strangers(self, pgn: int, now_s: float) -> tuple[int, ...]:
+        """Addresses that sent this feedback group within the last second and belong to no attached device."""
+        return tuple(sorted(a for (of_pgn, a), t in self._strangers.items() if of_pgn == pgn and now_s - t < 1.0))
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -180,7 +183,7 @@ class CanLink:
             ]
 
     async def close(self) -> None:
-        """Motion disabled several times for every actuator, then silent and closed; idempotent."""
+        """Every device told to hold, several times, then silent and closed; idempotent."""
         tasks, self._tasks = self._tasks, []
         for task in tasks:
             task.cancel()
@@ -198,19 +201,21 @@ class CanLink:
         self._drop_port()
 
     def attach(self, user: LinkUser) -> None:
-        """Put an actuator on the schedule.
+        """Put a device on the schedule.
 
         Raises:
             DeviceError: another one has the same address.
         """
         if self._users.get(user.address, user) is not user:
-            raise DeviceError(self.where, f"two actuators are configured for address {user.address}", "Check address_n")
+            raise DeviceError(self.where, f"two devices are configured for address {user.address}", "Check address_n")
         self._users[user.address] = user
+        self._feedback_pgns = frozenset(each.feedback_pgn for each in self._users.values())
 
     def detach(self, user: LinkUser) -> None:
-        """Take an actuator off the schedule; its messages stop."""
+        """Take a device off the schedule; its messages stop."""
         if self._users.get(user.address) is user:
             del self._users[user.address]
+            self._feedback_pgns = frozenset(each.feedback_pgn for each in self._users.values())
 
     def tap(self, listener: Callable[[Frame, float], None]) -> Callable[[], None]:
         """Call ``listener`` with every frame received or sent; returns the call that ends it."""
@@ -225,7 +230,7 @@ class CanLink:
     # -- sending ----------------------------------------------------------------------------------------------------
 
     def send_control(self, user: LinkUser) -> bool:
-        """Send one actuator's control message now; False where that is impossible."""
+        """Send one device's control message now; False where that is impossible."""
         frame = self._control(user)
         return frame is not None and self._send(frame)
 
@@ -240,12 +245,11 @@ class CanLink:
         self._node.publish(dtcs, amber=bool(dtcs), red=stopped, now_s=self._clock.now_s())
 
     def _control(self, user: LinkUser) -> Frame | None:
-        """An actuator's control message as it is now; None while nothing can be sent."""
+        """A device's control message as it is now; None while nothing can be sent."""
         address = self._node.address
         if self._port is None or address is None:
             return None
-        can_id = make_id(_ACM_PRIORITY, Pgn.PROPRIETARY_A, address, user.address)
-        return Frame(can_id, user.control_data(self._clock.now_s()))
+        return user.control_frame(address, self._clock.now_s())
 
     def _send(self, frame: Frame) -> bool:
         if self._port is None:
@@ -299,16 +303,16 @@ class CanLink:
             tap(frame, now_s)
         if not frame.extended:
             return
-        can_id = frame.can_id
-        if can_id & _AFM_MASK == _AFM_MATCH:
-            source = source_of(can_id)
+        pgn = pgn_of(frame.can_id)
+        if pgn in self._feedback_pgns and destination_of(frame.can_id) in (GLOBAL, self._node.address):
+            source = source_of(frame.can_id)
             user = self._users.get(source)
-            if user is not None:
+            if user is not None and user.feedback_pgn == pgn:
                 user.on_feedback(frame.data, now_s)
             else:
-                self._strangers[source] = now_s
+                self._strangers[pgn, source] = now_s
             return
-        if pgn_of(can_id) == Pgn.ADDRESS_CLAIMED:
+        if pgn == Pgn.ADDRESS_CLAIMED:
             self._on_claim(frame, now_s)
         message = self._node.on_frame(frame, now_s)
         if message is not None:
@@ -327,15 +331,15 @@ class CanLink:
     async def _schedule(self) -> None:
         """Every 20 ms protocol timers, every 100 ms on the same grid control messages; no catching up."""
         ticker = Ticker(_POLL_S, kernel=isinstance(self._clock, SystemClock), ahead_s=_AHEAD_S)
-        per_acm_n = round(ACM_PERIOD_S / _POLL_S)
+        per_control_n = round(CONTROL_PERIOD_S / _POLL_S)
         tick_n, sent_for_n = 0, -1
         try:
             while True:
-                if tick_n // per_acm_n != sent_for_n and self._port is not None:
-                    sent_for_n = tick_n // per_acm_n
+                if tick_n // per_control_n != sent_for_n and self._port is not None:
+                    sent_for_n = tick_n // per_control_n
                     frames = [frame for user in self._users.values() if (frame := self._control(user)) is not None]
                     ticker.meet()
-                    self.counters.acm_late_max_s = max(self.counters.acm_late_max_s, ticker.late_s)
+                    self.counters.control_late_max_s = max(self.counters.control_late_max_s, ticker.late_s)
                     for frame in frames:
                         self._send(frame)
                 self._node.poll(self._clock.now_s())
@@ -406,4 +410,4 @@ def name_from(settings: CanSettings) -> Name:
     )
 
 
-__all__ = ["ACM_PERIOD_S", "CanLink", "DeviceMissingError", "LinkCounters", "LinkUser", "name_from"]
+__all__ = ["CONTROL_PERIOD_S", "CanLink", "DeviceMissingError", "LinkCounters", "LinkUser", "name_from"]
