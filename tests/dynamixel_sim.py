@@ -17,7 +17,7 @@ import pytest
 
 from graderd.drivers.dynamixel import Ph54Rotator
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
 from tests.awake_clock import AwakeClock
 
@@ -111,7 +111,7 @@ async def bench(
     clock = AwakeClock()
     bus = VirtualServoBus([servo], folder / "servo", clock=clock, **(wire or {}))
     brisk = {"speed_deg_per_s": 50.0, "acceleration_deg_per_s2": 200.0}  # so that tests need not wait for the blade
-    settings = RotatorSettings(**{"port": str(folder / "servo"), **brisk, **changes})
+    settings = Ph54Settings(**{"port": str(folder / "servo"), **brisk, **changes})
     rotator = Ph54Rotator(settings, clock=clock)
     await bus.start()
     try:

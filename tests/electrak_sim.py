@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from graderd.drivers.electrak import CanLink, ElectrakActuator
 from graderd.drivers.j1939.can_port import BusPort
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.settings import ActuatorSettings, CanSettings
+from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 
 T = TypeVar("T")
@@ -117,7 +117,7 @@ class Machine:
             "tilt": {"address_n": 27, "profile": "electrak_md_a050", "max_mm": 95.0, "current_limit_a": 5.0},
         }
         self.axes = {
-            name: ElectrakActuator(name, ActuatorSettings.model_validate(defaults[name] | changes), self.link, clock)
+            name: ElectrakActuator(name, ElectrakSettings.model_validate(defaults[name] | changes), self.link, clock)
             for name in names
         }
 

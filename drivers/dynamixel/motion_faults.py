@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 
 _STILL_DEG_PER_S = 0.8
 """Below that the blade counts as standing."""
@@ -43,7 +43,7 @@ class Sample:
 class MotionDetectors:
     """Watches one axis; :meth:`look` returns the conditions present with their detail."""
 
-    def __init__(self, settings: RotatorSettings) -> None:
+    def __init__(self, settings: Ph54Settings) -> None:
         self._settings = settings
         self.restart()
 

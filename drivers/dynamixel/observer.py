@@ -14,7 +14,7 @@ from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.clock import Clock
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 
 _CORRUPT_N, _CORRUPT_WINDOW_S = 3, 1.0
 MOTION_FAULTS = frozenset(
@@ -31,7 +31,7 @@ class ServoObserver:
     """
 
     def __init__(
-        self, device_name: str, settings: RotatorSettings, table: ControlTable, calibration: Calibration, clock: Clock
+        self, device_name: str, settings: Ph54Settings, table: ControlTable, calibration: Calibration, clock: Clock
     ) -> None:
         self.telemetry = RotatorTelemetry()
         self.faults = FaultBook(device_name)

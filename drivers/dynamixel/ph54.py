@@ -31,7 +31,7 @@ from graderd.hal.errors import (
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.rotator import RotatorTelemetry
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ class Ph54Rotator:
 
     def __init__(
         self,
-        settings: RotatorSettings,
+        settings: Ph54Settings,
         clock: Clock | None = None,
         bus_log: BusLog | None = None,
         *,
@@ -89,7 +89,8 @@ class Ph54Rotator:
 
     def faults(self) -> tuple[DeviceFault, ...]:
         """Conditions present now. Events (trips, lost turns) stay visible for a second after they happened."""
-        return self._observer.faults.present(self._clock.now_s())
+        present, slow = self._observer.faults.present(self._clock.now_s()), self._link.slow_adapter
+        return present if slow is None else (*present, slow)
 
     async def wait_telemetry(self) -> RotatorTelemetry:
         """The next telemetry, as soon as it was read (or the connection's state changed)."""

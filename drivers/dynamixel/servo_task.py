@@ -18,7 +18,7 @@ from graderd.drivers.dynamixel.observer import MOTION_FAULTS, ServoObserver
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceError, DeviceLostError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 
 
 class CommandSlot:
@@ -27,7 +27,7 @@ class CommandSlot:
     ``goal_deg``: the goal in force, None while holding. ``hold_wanted``: a hold that has not gone out yet.
     """
 
-    def __init__(self, settings: RotatorSettings, calibration: Calibration) -> None:
+    def __init__(self, settings: Ph54Settings, calibration: Calibration) -> None:
         self.goal_deg: float | None = None
         self.hold_wanted = False
         self._goal_s = -math.inf
@@ -109,7 +109,7 @@ class ServoTask:
     """
 
     def __init__(
-        self, settings: RotatorSettings, link: ServoLink, observer: ServoObserver, command: CommandSlot, clock: Clock
+        self, settings: Ph54Settings, link: ServoLink, observer: ServoObserver, command: CommandSlot, clock: Clock
     ) -> None:
         self.lifecycle = Lifecycle.CLOSED
         self.torque_is_ours = False

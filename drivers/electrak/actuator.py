@@ -35,7 +35,7 @@ from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
-from graderd.hal.settings import ActuatorSettings
+from graderd.hal.settings import ElectrakSettings
 
 WAKE_TIMEOUT_S: Final = 3.0
 _SILENCE_S: Final = 1.0
@@ -59,7 +59,7 @@ class ElectrakActuator:
     * a latched fault (see ``monitor.LATCHING``) goes with the next successful :meth:`arm`.
     """
 
-    def __init__(self, name: str, settings: ActuatorSettings, link: CanLink, clock: Clock | None = None) -> None:
+    def __init__(self, name: str, settings: ElectrakSettings, link: CanLink, clock: Clock | None = None) -> None:
         self.name = name
         self.settings = settings
         self.profile = load_profile(settings.profile).with_figures(settings.figures)

@@ -7,11 +7,14 @@ import tomllib
 import types
 import typing
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Tag, ValidationError
 
 from graderd.config.models import Config
+from graderd.hal.settings import Settings
+
+S = TypeVar("S", bound=Settings)
 
 DEFAULT_PATHS = (Path("/etc/graderd/graderd.toml"),)
 
@@ -62,16 +65,41 @@ def parse(data: dict[str, Any], path: Path | None = None, text: str = "") -> Con
         return Config.model_validate(data)
     except ValidationError as error:
         where = str(path) if path else "configuration"
-        raise ConfigError(path, [_explain(where, text, dict(e)) for e in error.errors()]) from None
+        raise ConfigError(path, explain(error, Config, where=where, text=text)) from None
 
 
-def _explain(where: str, text: str, error: dict[str, Any]) -> str:
-    location = [str(part) for part in error["loc"]]
+def parse_section(name: str, section: Settings, model: type[S]) -> S:
+    """A section of the configuration as ``model`` takes it: for a driver from elsewhere, which brings its own.
+
+    Raises:
+        ConfigError: as :func:`parse`.
+    """
+    try:
+        return model.model_validate(section.model_dump())
+    except ValidationError as error:
+        raise ConfigError(None, explain(error, model, (name,))) from None
+
+
+def explain(
+    error: ValidationError,
+    model: type[BaseModel],
+    under: tuple[str, ...] = (),
+    *,
+    where: str = "configuration",
+    text: str = "",
+) -> list[str]:
+    """One line per mistake. ``under``: where in the configuration ``model`` belongs."""
+    return [_explain(dict(each), model, list(under), where, text) for each in error.errors()]
+
+
+def _explain(error: dict[str, Any], model: type[BaseModel], under: list[str], where: str, text: str) -> str:
+    inner, parent = _place_of([str(part) for part in error["loc"]], model)
+    location = under + inner
     name = _dotted(location)
     line = _line_of(text, location)
     place = f"{where}:{line}" if line else where
     if error["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(location[-1], _known_keys(location[:-1]), n=1, cutoff=0.5)
+        near = difflib.get_close_matches(location[-1], list(parent.model_fields) if parent else [], n=1, cutoff=0.5)
         remedy = f"Did you mean {_dotted([*location[:-1], near[0]])}?" if near else "Remove it"
         return f"{place}: {name}: unknown key. {remedy}"
     cause = error["msg"].removeprefix("Value error, ")
@@ -98,19 +126,31 @@ def _line_of(text: str, location: list[str]) -> int:
     return 0
 
 
-def _known_keys(location: list[str]) -> list[str]:
-    """Keys allowed at a place of the configuration."""
-    model: type[BaseModel] | None = Config
-    for part in location:
-        if model is None or part not in model.model_fields:
-            return []
-        model = _model_in(model.model_fields[part].annotation)
-    return list(model.model_fields) if model else []
+def _place_of(parts: list[str], model: type[BaseModel] | None) -> tuple[list[str], type[BaseModel] | None]:
+    """Keys on the way to a mistake, and the model that the last of them belongs to.
+
+    Where a section has several models, pydantic names the tag of the one it took after the section's key; a file has
+    no such word.
+    """
+    location: list[str] = []
+    while parts:
+        location.append(parts.pop(0))
+        if not parts:
+            break
+        field = model.model_fields.get(location[-1]) if model else None
+        models = _models_in(field.annotation) if field else {}
+        model = models[parts.pop(0)] if len(models) > 1 and parts[0] in models else next(iter(models.values()), None)
+    return location, model
 
 
-def _model_in(annotation: Any) -> type[BaseModel] | None:
+def _models_in(annotation: Any) -> dict[str, type[BaseModel]]:
+    """The models that may stand somewhere, by their tag; one without a tag by its name."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
+        return {annotation.__name__: annotation}
+    if typing.get_origin(annotation) is typing.Annotated:
+        inner, *notes = typing.get_args(annotation)
+        tag = next((note.tag for note in notes if isinstance(note, Tag)), None)
+        return {tag or name: model for name, model in _models_in(inner).items()}
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        return next((m for a in typing.get_args(annotation) if (m := _model_in(a))), None)
-    return None
+        return {name: model for each in typing.get_args(annotation) for name, model in _models_in(each).items()}
+    return {}

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.core.attitude import AttitudeGeometry, Preset
@@ -15,14 +15,22 @@ from graderd.core.lift_pair import LiftPairSettings
 from graderd.core.machine import MachineSettings
 from graderd.core.rule import RuleSettings
 from graderd.hal.settings import (
+    IN_TREE,
+    PLUGIN,
     ActuatorSettings,
+    AnyRotatorSettings,
+    AnyStopInputSettings,
     CameraSettings,
     CanSettings,
+    ElectrakSettings,
     NotNegative,
+    Ph54Settings,
+    PluginActuatorSettings,
+    PluginCameraSettings,
     Positive,
-    RotatorSettings,
     Settings,
     StopInputSettings,
+    tag_of,
 )
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
 
@@ -74,17 +82,23 @@ class CameraSection(CameraSettings):
     calibration: CameraCalibration = Field(default_factory=CameraCalibration)
 
 
-class LiftLeftSection(ActuatorSettings):
+class PluginCameraSection(PluginCameraSettings):
+    """A camera by a driver from elsewhere, with its calibration."""
+
+    calibration: CameraCalibration = Field(default_factory=CameraCalibration)
+
+
+class LiftLeftSection(ElectrakSettings):
     """The left lift: an Electrak HD with no address pin wired."""
 
 
-class LiftRightSection(ActuatorSettings):
+class LiftRightSection(ElectrakSettings):
     """The right lift: the same unit with address select 1."""
 
     address_n: int = Field(20, ge=0, le=253)
 
 
-class TiltSection(ActuatorSettings):
+class TiltSection(ElectrakSettings):
     """The tilt: an Electrak MD of 500 N and 100 mm."""
 
     address_n: int = Field(27, ge=0, le=253)
@@ -108,19 +122,30 @@ def _presets() -> dict[str, Preset]:
     }
 
 
+_Plugin = Annotated[PluginActuatorSettings, Tag(PLUGIN)]
+
+
 class Config(Settings):
     """Everything. Sections that are absent take their defaults."""
 
     version: Literal[2] = 2
     simulated: bool = False
-    camera: CameraSection = Field(default_factory=CameraSection)
+    camera: Annotated[
+        Annotated[CameraSection, Tag(IN_TREE)] | Annotated[PluginCameraSection, Tag(PLUGIN)], Discriminator(tag_of)
+    ] = Field(default_factory=CameraSection)
     perception: PerceptionSettings = Field(default_factory=PerceptionSettings)
     blade: BladeGeometry = Field(default_factory=BladeGeometry)
-    rotation: RotatorSettings = Field(default_factory=RotatorSettings)
+    rotation: AnyRotatorSettings = Field(default_factory=Ph54Settings)
     can: CanSettings = Field(default_factory=CanSettings)
-    lift_left: LiftLeftSection = Field(default_factory=LiftLeftSection)
-    lift_right: LiftRightSection = Field(default_factory=LiftRightSection)
-    tilt: TiltSection = Field(default_factory=TiltSection)
+    lift_left: Annotated[Annotated[LiftLeftSection, Tag(IN_TREE)] | _Plugin, Discriminator(tag_of)] = Field(
+        default_factory=LiftLeftSection
+    )
+    lift_right: Annotated[Annotated[LiftRightSection, Tag(IN_TREE)] | _Plugin, Discriminator(tag_of)] = Field(
+        default_factory=LiftRightSection
+    )
+    tilt: Annotated[Annotated[TiltSection, Tag(IN_TREE)] | _Plugin, Discriminator(tag_of)] = Field(
+        default_factory=TiltSection
+    )
     attitude: AttitudeGeometry = Field(default_factory=AttitudeGeometry)
     lift_pair: LiftPairSettings = Field(default_factory=LiftPairSettings)
     rule: RuleSettings = Field(default_factory=RuleSettings)
@@ -130,19 +155,19 @@ class Config(Settings):
     api: ApiSettings = Field(default_factory=ApiSettings)
     recording: RecordingSettings = Field(default_factory=RecordingSettings)
     state: StateSettings = Field(default_factory=StateSettings)
-    stop_input: StopInputSettings = Field(default_factory=StopInputSettings)
+    stop_input: AnyStopInputSettings = Field(default_factory=StopInputSettings)
     presets: dict[str, Preset] = Field(default_factory=_presets)
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
-        addresses = [
-            self.lift_left.address_n,
-            self.lift_right.address_n,
-            self.tilt.address_n,
-            self.can.source_address_n,
-        ]
-        if len(set(addresses)) != len(addresses):
-            raise ValueError(f"lift_left, lift_right, tilt and can need four different addresses, not {addresses}")
+        electraks = {name: axis for name, axis in self.actuators().items() if isinstance(axis, ElectrakSettings)}
+        addresses = {name: axis.address_n for name, axis in electraks.items()} | {"can": self.can.source_address_n}
+        if len(set(addresses.values())) != len(addresses):
+            *some, last = addresses
+            raise ValueError(
+                f"{', '.join(some)} and {last} need {len(addresses)} different addresses, not "
+                f"{list(addresses.values())}"
+            )
         for zone, angle_deg in (
             ("left_deg", self.rule.left_deg),
             ("right_deg", self.rule.right_deg),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -16,6 +16,7 @@ from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.rotator import Rotator
+from graderd.hal.service import DeviceService
 
 RETRY_S = 1.0
 
@@ -58,6 +59,8 @@ class Devices:
     rotation: Rotator
     link: Link
     actuators: dict[str, LinearActuator]
+    services: Mapping[str, DeviceService] = field(default_factory=dict)
+    """What the drivers offer besides, as ``device.name``; what a driver has not is absent."""
     publish_faults: Callable[[tuple[DeviceFault, ...], bool], None] = _publish_nowhere
     """Puts the active faults, and whether the machine is stopped, on the bus as diagnostic messages (DM1)."""
     watch_bus: Callable[[Callable[[str], None]], Callable[[], None]] = _watch_nothing

@@ -26,7 +26,7 @@ from graderd.hal.errors import (
 )
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
-from graderd.hal.settings import ActuatorSettings, CanSettings
+from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from tests.awake_clock import AwakeClock
 from tests.electrak_sim import until
@@ -56,7 +56,7 @@ class Bench:
             self.external = can.Bus(interface="socketcan", channel=wire)
         self.bus = VirtualActuatorBus([self.unit], link=link, bus=self.external, clock=self.clock)
         self.link = CanLink(settings, self.clock, bus_factory=factory)
-        self.axis = ElectrakActuator("lift_left", ActuatorSettings(address_n=19), self.link, self.clock)
+        self.axis = ElectrakActuator("lift_left", ElectrakSettings(address_n=19), self.link, self.clock)
         self._relay: asyncio.Task[None] | None = None
         self._relay_bus = (
             can.Bus(interface="virtual", channel=settings.channel) if wire == "python_can_virtual" else None
@@ -218,7 +218,7 @@ async def test_no_answer_is_a_timeout_that_says_what_to_look_at(bench: Bench) ->
 )
 async def test_a_channel_that_does_not_exist_is_said_at_once(settings: CanSettings, why: str) -> None:
     link = CanLink(settings)
-    axis = ElectrakActuator("tilt", ActuatorSettings(), link)
+    axis = ElectrakActuator("tilt", ElectrakSettings(), link)
     with pytest.raises(DeviceMissingError, match=why):
         await axis.open()
     assert state(axis) is Lifecycle.CLOSED
@@ -229,7 +229,7 @@ async def test_a_channel_that_does_not_exist_is_said_at_once(settings: CanSettin
 async def test_settings_beyond_the_model_are_refused(tmp_path: Path) -> None:
     link = CanLink(CanSettings(interface="virtual", channel=str(tmp_path)))
     with pytest.raises(CommandRangeError, match="beyond the stroke of 100"):
-        ElectrakActuator("tilt", ActuatorSettings(profile="electrak_md_a050"), link)
+        ElectrakActuator("tilt", ElectrakSettings(profile="electrak_md_a050"), link)
 
 
 async def test_a_fault_present_forbids_arming(bench: Bench) -> None:

@@ -19,7 +19,7 @@ from graderd.drivers.j1939.can_port import PortLostError, SlcanPort, SocketCanPo
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of
 from graderd.drivers.j1939.slcan_bus import QuietSlcanBus
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.settings import ActuatorSettings, CanSettings
+from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from tests.electrak_sim import conditions, state, until
 
@@ -32,7 +32,7 @@ async def slcan_machine(tmp_path: Path):  # type: ignore[no-untyped-def]
     bus = VirtualActuatorBus([unit], link=tmp_path / "can")
     await bus.start()
     link = CanLink(CanSettings(interface="slcan", channel=str(tmp_path / "can")))
-    axis = ElectrakActuator("lift_left", ActuatorSettings(), link)
+    axis = ElectrakActuator("lift_left", ElectrakSettings(), link)
     try:
         await axis.open()
         yield bus, link, axis

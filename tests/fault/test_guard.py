@@ -17,7 +17,7 @@ import pytest
 from graderd.drivers.dynamixel.calibration import Calibration
 from graderd.drivers.electrak.codec import Control, ElectrakCodec
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
 from tests.fault.campaign.conduct import EVERYTHING, come_to
@@ -119,7 +119,7 @@ async def _set_off(servo: VirtualServo, units: dict[str, VirtualElectrak], can_w
         for name, unit in units.items():
             _send(can_wire, name, unit.address, enable=enable)
         await asyncio.sleep(0.3)
-    table, calibration = servo.table, Calibration.of(RotatorSettings(), servo.table)
+    table, calibration = servo.table, Calibration.of(Ph54Settings(), servo.table)
     servo.write(table["torque_enable"].address, b"\x01")
     servo.write(table["profile_velocity"].address, round(10.0 / 0.06).to_bytes(4, "little"))
     servo.write(table["profile_acceleration"].address, round(60.0 / 0.1).to_bytes(4, "little"))

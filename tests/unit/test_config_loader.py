@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graderd.config import Config, ConfigError, load, parse
+from graderd.hal.settings import ElectrakSettings
 
 
 def problems(text: str, path: Path) -> list[str]:
@@ -45,7 +46,7 @@ def test_all_mistakes_at_once(tmp_path: Path) -> None:
         ("[rotation]\nmin_deg = 10\nmax_deg = -10\n", "min_deg (10.0) must be below max_deg (-10.0)"),
         ("[rule]\nleft_deg = 80\n", "rule.left_deg (80) lies outside rotation.min_deg"),
         ("[camera]\nrate_hz = 1.9\n", "until their product is 3 or more"),
-        ("[lift_left]\naddress_n = 20\n", "four different addresses"),
+        ("[lift_left]\naddress_n = 20\n", "4 different addresses"),
         ("[rule]\nleft_deg = nan\n", "finite"),
         ("[control]\nshutdown_order = ['rotation']\n", "shutdown_order"),
         ("version = 3\n", "version"),
@@ -81,6 +82,8 @@ def test_nonsense_never_raises_anything_else(data: dict[str, object]) -> None:
 
 def test_a_section_given_in_part_keeps_its_own_defaults_for_the_rest() -> None:
     config = parse({"lift_right": {"speed_percent": 60}, "tilt": {"speed_percent": 60}})
-    assert (config.lift_left.address_n, config.lift_right.address_n, config.tilt.address_n) == (19, 20, 27)
-    assert config.tilt.profile == Config().tilt.profile == "electrak_md_a050"
+    sections = [config.lift_left, config.lift_right, config.tilt]
+    assert [section.model_dump()["address_n"] for section in sections] == [19, 20, 27]
+    assert isinstance(config.tilt, ElectrakSettings)
+    assert config.tilt.profile == "electrak_md_a050"
     assert config.tilt.max_mm == 97.0

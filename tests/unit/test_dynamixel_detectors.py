@@ -14,11 +14,11 @@ from graderd.drivers.dynamixel.calibration import Calibration
 from graderd.drivers.dynamixel.faultbook import FaultBook
 from graderd.drivers.dynamixel.motion_faults import MotionDetectors, Sample
 from graderd.drivers.dynamixel.table import ControlTable
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo.motion import Profile, Trajectory
 
 TABLE = ControlTable.load("ph54_200_s500")
-SETTINGS = RotatorSettings()
+SETTINGS = Ph54Settings()
 
 
 def watch(
@@ -108,7 +108,7 @@ def test_near_limits_have_hysteresis_and_clear() -> None:
 # -- calibration ------------------------------------------------------------------------------------------------
 
 _settings = st.builds(
-    RotatorSettings,
+    Ph54Settings,
     zero_deg=st.floats(-90, 90),
     sign=st.sampled_from([1, -1]),
     gear_ratio=st.floats(0.2, 20),
@@ -116,14 +116,14 @@ _settings = st.builds(
 
 
 @given(_settings, st.floats(-60, 60))
-def test_angles_survive_the_way_to_counts_and_back(made: RotatorSettings, angle_deg: float) -> None:
+def test_angles_survive_the_way_to_counts_and_back(made: Ph54Settings, angle_deg: float) -> None:
     cal = Calibration.of(made, TABLE)
     count_deg = 360.0 / TABLE.profile["motion"]["pulses_per_turn"] / made.gear_ratio
     assert cal.blade_deg(cal.counts(angle_deg)) == pytest.approx(angle_deg, abs=count_deg)
 
 
 @given(_settings)
-def test_the_servos_limits_lie_just_outside_the_soft_ones_whichever_way_it_turns(made: RotatorSettings) -> None:
+def test_the_servos_limits_lie_just_outside_the_soft_ones_whichever_way_it_turns(made: Ph54Settings) -> None:
     cal = Calibration.of(made, TABLE)
     low, high = cal.servo_limits()
     assert low < high
@@ -133,7 +133,7 @@ def test_the_servos_limits_lie_just_outside_the_soft_ones_whichever_way_it_turns
 
 
 def test_the_documented_example_and_signs() -> None:
-    cal = Calibration.of(RotatorSettings(zero_deg=5.0, sign=-1, gear_ratio=2.0), TABLE)
+    cal = Calibration.of(Ph54Settings(zero_deg=5.0, sign=-1, gear_ratio=2.0), TABLE)
     assert cal.blade_deg(1_003_846 // 2) == pytest.approx(-95.0)
     assert cal.blade_deg_per_s(1000) == pytest.approx(-30.0)
     assert cal.torque_nm(1000) == pytest.approx(-2 * 4.806)
@@ -141,14 +141,14 @@ def test_the_documented_example_and_signs() -> None:
     assert cal.acceleration_counts(60.0) == 1200
     assert cal.velocity_counts(1e-6) == cal.acceleration_counts(1e-6) == 1  # 0 would mean "no limit"
     assert not cal.needs_turns
-    assert Calibration.of(RotatorSettings(gear_ratio=4.0), TABLE).needs_turns
+    assert Calibration.of(Ph54Settings(gear_ratio=4.0), TABLE).needs_turns
     assert cal.within_limits(60.0)
     assert not cal.within_limits(math.nan)
 
 
 @pytest.mark.parametrize(("seconds", "counts"), [(0.2, 9), (0.02, 1), (0.001, 1), (2.54, 126), (0.1, 4)])
 def test_the_watchdog_leaves_time_to_brake(seconds: float, counts: int) -> None:
-    assert watchdog_counts(RotatorSettings(watchdog_s=seconds)) == counts
+    assert watchdog_counts(Ph54Settings(watchdog_s=seconds)) == counts
 
 
 # -- fault book -------------------------------------------------------------------------------------------------

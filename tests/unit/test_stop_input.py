@@ -19,7 +19,8 @@ from pydantic import ValidationError
 from graderd.config import Config
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import Clear, Reaction
-from graderd.drivers.stop_input import GpioStopInput, SerialStopInput, SimulatedStopInput, make_stop_input
+from graderd.drivers.simulated.stop_input import SimulatedStopInput
+from graderd.drivers.stop_input import GpioStopInput, SerialStopInput
 from graderd.hal.clock import ManualClock, SystemClock
 from graderd.hal.errors import DeviceLostError, DeviceMissingError
 from graderd.hal.settings import StopInputSettings
@@ -113,8 +114,7 @@ def test_a_pulled_adapter_is_lost_and_the_port_let_go() -> None:
 
 
 def test_a_port_that_is_not_there_or_has_no_lines_is_missing(tmp_path: Path) -> None:
-    missing = make_stop_input(StopInputSettings(backend="serial", port=str(tmp_path / "none")))
-    assert missing is not None
+    missing = SerialStopInput(StopInputSettings(backend="serial", port=str(tmp_path / "none")))
     with pytest.raises(DeviceMissingError, match="Check its cable"):
         missing.open()
     # A pseudo-terminal opens, and has no modem lines: the ioctl fails.
@@ -124,8 +124,7 @@ def test_a_port_that_is_not_there_or_has_no_lines_is_missing(tmp_path: Path) -> 
     import os
 
     try:
-        without = make_stop_input(StopInputSettings(backend="serial", port=os.ttyname(slave)))
-        assert without is not None
+        without = SerialStopInput(StopInputSettings(backend="serial", port=os.ttyname(slave)))
         with pytest.raises(DeviceMissingError):
             without.open()
     finally:
@@ -219,8 +218,7 @@ def test_a_gpio_chip_that_is_not_there_is_missing(tmp_path: Path) -> None:
     no_chip = tmp_path / "file"
     no_chip.write_text("", encoding="utf-8")
     for path in (tmp_path / "none", no_chip, Path("/dev/null")):
-        source = make_stop_input(StopInputSettings(backend="gpio", port=str(path)))
-        assert isinstance(source, GpioStopInput)
+        source = GpioStopInput(StopInputSettings(backend="gpio", port=str(path)))
         with pytest.raises(DeviceMissingError, match="cannot be used as stop input"):
             source.open()
 
@@ -232,7 +230,6 @@ def test_without_its_package_the_gpio_backend_says_how_to_get_it(monkeypatch: py
 
 
 def test_settings() -> None:
-    assert make_stop_input(StopInputSettings()) is None
     assert Config().stop_input.backend == "none"
     with pytest.raises(ValidationError, match="needs a port"):
         StopInputSettings(backend="serial")
@@ -240,7 +237,6 @@ def test_settings() -> None:
         StopInputSettings(backend="gpio")
     with pytest.raises(ValidationError, match="two lines"):
         StopInputSettings(backend="gpio", port="/dev/gpiochip0", gpio_drive_n=4, gpio_sense_n=4)
-    assert isinstance(make_stop_input(StopInputSettings(backend="simulated", port="x")), SimulatedStopInput)
 
 
 @pytest.mark.parametrize("condition", ["open", "lost", "stale", "stuck"])

@@ -17,10 +17,9 @@ from graderd.api.server import serve
 from graderd.config import Config, ConfigError, load
 from graderd.core import commands as cmd
 from graderd.core.machine import Mode
-from graderd.drivers.dynamixel.ph54 import Ph54Rotator
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
-from graderd.runtime.app.adapter_watch import AdapterWatch
+from graderd.runtime.app.backends import check_plugins
 from graderd.runtime.app.devices import build_devices, build_stop_input
 from graderd.runtime.app.services import build_services
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
@@ -43,6 +42,7 @@ def run_daemon(config_path: Path | None, sim: bool, rig_dir: Path | None, as_jso
     set_up_logging(as_json)
     try:
         config = load(config_path)
+        check_plugins(config)
     except ConfigError as error:
         for line in error.problems:
             log.error("%s", line)
@@ -94,14 +94,11 @@ class Daemon:
         )
         self._devices = build_devices(config, clock, on_bus_stop=self._stop_from_bus)
         self._loop = ControlLoop(config, self._devices, self._eyes, clock, StateFile(config.state.directory))
-        rotator = self._devices.rotation
-        assert isinstance(rotator, Ph54Rotator)  # build_devices made it
-        self._port = Port(
-            config, self._loop, self._devices, self._eyes, build_services(config, rotator, self._loop, self._eyes)
-        )
+        services = build_services(config, self._devices, self._loop, self._eyes)
+        self._port = Port(config, self._loop, self._devices, self._eyes, services)
         self._recorder = Recorder(config)
         self._health = HealthWatch(config)
-        self._loop.fault_sources += [AdapterWatch(rotator).faults, self._recorder.faults, self._health.faults]
+        self._loop.fault_sources += [self._recorder.faults, self._health.faults]
         self._stop_input = build_stop_input(config, clock, on_stop=self._stop_from_input)
         if self._stop_input is not None:
             self._loop.fault_sources.append(self._stop_input.faults)

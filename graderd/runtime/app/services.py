@@ -1,4 +1,4 @@
-"""Device services outside the control loop: read the servo's profile, reboot it, step response, camera calibration."""
+"""Services outside the control loop: those of the drivers, step response, camera calibration."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from typing import Any, TypeVar
 from pydantic import Field, ValidationError
 
 from graderd.config import Config
-from graderd.drivers.dynamixel.ph54 import Ph54Rotator
 from graderd.drivers.dynamixel.step import StepSample, analyse, render
 from graderd.hal.errors import CommandRangeError, DeviceMissingError
-from graderd.hal.settings import Finite, Positive, Settings
+from graderd.hal.rotator import Rotator
+from graderd.hal.service import DeviceService
+from graderd.hal.settings import Finite, Ph54Settings, Positive, RotatorSettings, Settings
 from graderd.runtime.control import ControlLoop
+from graderd.runtime.devices import Devices
 from graderd.runtime.maneuver import Maneuver
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
-from graderd.runtime.port import Service
 
 T = TypeVar("T", bound=Settings)
 STEP_SHARES = (1.0, 0.5, 0.0, 0.5, 0.0)
@@ -42,41 +43,26 @@ class CalibrateArguments(Settings):
 
 
 def build_services(
-    config: Config, rotator: Ph54Rotator, loop: ControlLoop, eyes: PerceptionSupervisor
-) -> dict[str, Service]:
-    """The services by name. Each takes the request's arguments and returns a JSON object."""
-
-    async def verify_profile(_: dict[str, Any]) -> dict[str, Any]:
-        return {"differences": [asdict(difference) for difference in await rotator.verify_profile()]}
-
-    async def reboot(_: dict[str, Any]) -> dict[str, Any]:
-        await rotator.reboot()
-        return {"rebooted": True}
-
-    async def confirm_turns(_: dict[str, Any]) -> dict[str, Any]:
-        rotator.confirm_turns()
-        return {"confirmed": True}
+    config: Config, devices: Devices, loop: ControlLoop, eyes: PerceptionSupervisor
+) -> dict[str, DeviceService]:
+    """The services by name."""
 
     async def step_response(arguments: dict[str, Any]) -> dict[str, Any]:
         wanted = _checked(StepArguments, arguments)
-        return await _step_response(config, rotator, loop, wanted)
+        return await _step_response(config, devices.rotation, loop, wanted)
 
     async def calibrate(arguments: dict[str, Any]) -> dict[str, Any]:
         wanted = _checked(CalibrateArguments, arguments)
         return await _collect_frames(config, loop, eyes, wanted)
 
     return {
-        "rotation.verify_profile": verify_profile,
-        "rotation.reboot": reboot,
-        "rotation.confirm_turns": confirm_turns,
-        "rotation.step_response": step_response,
-        "camera.calibrate": calibrate,
+        **devices.services,
+        "rotation.step_response": DeviceService(step_response),
+        "camera.calibrate": DeviceService(calibrate),
     }
 
 
-async def _step_response(
-    config: Config, rotator: Ph54Rotator, loop: ControlLoop, wanted: StepArguments
-) -> dict[str, Any]:
+async def _step_response(config: Config, rotator: Rotator, loop: ControlLoop, wanted: StepArguments) -> dict[str, Any]:
     """Steps through machine and gate: what is measured is what the blade does in operation."""
     samples: list[StepSample] = []
     async with Maneuver(loop) as blade:
@@ -87,14 +73,14 @@ async def _step_response(
 
         def sample(goal_deg: float) -> None:
             told = rotator.telemetry()
-            if told.angle_deg and told.velocity_deg_per_s and told.current_a:
+            if told.angle_deg and told.velocity_deg_per_s:
                 samples.append(
                     StepSample(
                         told.angle_deg.time_s - began_s,
                         goal_deg,
                         told.angle_deg.value,
                         told.velocity_deg_per_s.value,
-                        told.current_a.value,
+                        told.current_a.value if told.current_a else None,
                     )
                 )
 
@@ -105,9 +91,8 @@ async def _step_response(
     settings = {
         "goal's speed": f"{rotation.speed_deg_per_s:g} deg/s",
         "goal's acceleration": f"{rotation.acceleration_deg_per_s2:g} deg/s²",
-        "profile velocity": f"{rotation.profile_velocity_deg_per_s:g} deg/s",
-        "profile acceleration": f"{rotation.profile_acceleration_deg_per_s2:g} deg/s²",
-        "current limit": f"{rotation.current_limit_a:g} A",
+        "driver": rotation.backend,
+        **_own_figures(rotation),
         "simulated": "yes" if config.simulated else "no",
     }
     recording = analyse(samples, rotation.tolerance_deg, settings)
@@ -117,6 +102,17 @@ async def _step_response(
         "backlash_from": recording.backlash_from,
         "settings": settings,
         "report_html": render(recording, when=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
+    }
+
+
+def _own_figures(rotation: RotatorSettings) -> dict[str, str]:
+    """What the driver itself holds to, where it is one that has such settings."""
+    if not isinstance(rotation, Ph54Settings):
+        return {}
+    return {
+        "profile velocity": f"{rotation.profile_velocity_deg_per_s:g} deg/s",
+        "profile acceleration": f"{rotation.profile_acceleration_deg_per_s2:g} deg/s²",
+        "current limit": f"{rotation.current_limit_a:g} A",
     }
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from graderd.config import Config
 from graderd.hal.errors import DeviceMissingError
+from graderd.hal.settings import Ph54Settings
 
 READY_TIMEOUT_S = 30.0
 RESTART_PAUSE_S = 1.0
@@ -108,7 +109,9 @@ def new_rig_directory() -> Path:
 
 
 def attach(config: Config, directory: Path) -> Config:
-    """The configuration with every wire replaced by the rig's; a camera that plays files is left as it is.
+    """The configuration with every wire replaced by the rig's.
+
+    A camera that plays files, and what has a driver from elsewhere, is left as it is.
 
     Raises:
         DeviceMissingError: no rig is ready in that directory.
@@ -127,9 +130,11 @@ def attach(config: Config, directory: Path) -> Config:
         "simulated": True,
         "perception": config.perception.model_copy(update={"decision": decision}),
         "camera": config.camera.model_copy(update=camera),
-        "rotation": config.rotation.model_copy(update={"port": rig["servo"], "usb_serial_number": ""}),
         "can": config.can.model_copy(update=rig["can"]),
     }
+    if isinstance(config.rotation, Ph54Settings):
+        on_rig = {"port": rig["servo"], "usb_serial_number": ""}
+        changes["rotation"] = config.rotation.model_copy(update=on_rig)
     if config.stop_input.backend == "simulated":
         changes["stop_input"] = config.stop_input.model_copy(update={"port": rig["stop_input"]})
     return config.model_copy(update=changes)
