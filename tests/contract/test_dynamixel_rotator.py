@@ -9,7 +9,7 @@ import pytest
 
 from graderd.drivers.dynamixel import Ph54Rotator
 from graderd.hal.lifecycle import Lifecycle
-from tests.contract.conformance import RotatorConformance, RotatorStand
+from tests.contract.conformance import RotatorConformance, RotatorStand, state
 from tests.dynamixel_sim import Bench
 from tests.dynamixel_sim import bench as make_bench
 
@@ -80,14 +80,11 @@ class TestPh54OverFourTransports(RotatorConformance):
 
     async def test_torque_is_on_while_armed_and_off_after_disarm_and_close(self, bench: Bench) -> None:
         await bench.rotator.open()
-        await bench.rotator.arm()
-        assert bench.servo.torque_enabled
-        await bench.rotator.disarm()
-        assert not bench.servo.torque_enabled
-        await bench.rotator.arm()
-        assert bench.servo.torque_enabled
-        await bench.rotator.close()
-        assert not bench.servo.torque_enabled
+        for end in (bench.rotator.disarm, bench.rotator.close):
+            await bench.rotator.arm()
+            assert bench.servo.torque_enabled
+            await end()
+            assert not bench.servo.torque_enabled
 
     async def test_hold_stops_within_the_braking_way(self, bench: Bench) -> None:
         await bench.rotator.open()
@@ -98,7 +95,7 @@ class TestPh54OverFourTransports(RotatorConformance):
         await bench.until(lambda: abs(bench.servo.shaft_velocity_deg_per_s) < 0.5)
         # what it turns within the 30 ms delay, and the braking
         assert bench.servo.shaft_deg == pytest.approx(held_deg, abs=6.0)
-        assert bench.rotator.lifecycle is Lifecycle.ACTIVE
+        assert state(bench.rotator) is Lifecycle.ACTIVE
 
     async def test_a_goal_not_renewed_is_counted(self, bench: Bench) -> None:
         await bench.rotator.open()

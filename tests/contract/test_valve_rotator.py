@@ -148,7 +148,7 @@ class ValveRotator:
     async def arm(self) -> None:
         self._require(Lifecycle.STANDBY)
         if self._link.address is None:
-            raise DeviceRefusedError("rotation", "graderd has no J1939 address yet", "Wait, or look at the can faults")
+            raise DeviceRefusedError("rotation", "graderd lost its J1939 address", "Look at the can faults")
         self._goal = None
         self._lifecycle = Lifecycle.ACTIVE
 
@@ -194,8 +194,9 @@ class ValveRotator:
             self._velocity = Reading(speed, now_s)
         self._angle = Reading(angle_deg, now_s)
         self._heard_n += 1
-        self._heard.set()
-        if self._lifecycle is Lifecycle.FAILED:
+        if self._link.address is not None:  # before that it is heard, and cannot be told anything
+            self._heard.set()
+        if self._lifecycle is Lifecycle.FAILED and self._link.address is not None:
             self._lifecycle, self._fault = Lifecycle.STANDBY, None
 
     def on_claim(self, name: int, solicited: bool, now_s: float) -> None: ...
