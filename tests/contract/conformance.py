@@ -498,3 +498,12 @@ class StopInputConformance:
             source.is_closed()
         source.open()
         assert source.is_closed()
+
+
+class ClockConformance:
+    """:class:`graderd.hal.clock.Clock`."""
+
+    def test_it_tells_finite_seconds_and_never_goes_back(self, clock: Clock) -> None:
+        looks = [clock.now_s() for _ in range(100)]
+        assert all(math.isfinite(look) for look in looks)
+        assert looks == sorted(looks)
