@@ -478,6 +478,7 @@ class StopInputConformance:
     def test_a_lost_port_is_no_permission_and_comes_back(self, stop_stand: StopInputStand) -> None:
         source = stop_stand.source
         source.open()
+        assert source.is_closed()
         stop_stand.become("gone")
         with pytest.raises(DeviceLostError):
             source.is_closed()

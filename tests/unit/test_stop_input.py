@@ -6,7 +6,7 @@ import asyncio
 import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +28,7 @@ from graderd.hal.stop_input import StopInput
 from graderd.runtime.stop_input import FIRST_WORD_S, StopInputWatch
 from graderd.simulator.stop_loop import StopLoop
 from tests.awake_clock import AwakeClock
+from tests.contract.conformance import StopInputConformance, StopInputStand
 
 DEADLINE_S = 5.0
 
@@ -379,3 +380,62 @@ def test_a_frozen_process_does_not_take_its_own_silence_for_the_loops(tmp_path: 
     after_s = thawed_s + 2.0 / settings.poll_hz
     assert watch.faults(after_s - 1e-6) == ()
     assert [fault.condition for fault in watch.faults(after_s)] == ["stale"]
+
+
+class WiredStand(StopInputStand):
+    """A driver on a fake port or chip."""
+
+    def __init__(self, source: StopInput, wire: FakePort | FakeGpio) -> None:
+        self.source = source
+        self._wire = wire
+
+    def become(self, loop: str) -> None:
+        self._wire.pressed, self._wire.shorted, self._wire.gone = loop == "open", loop == "shorted", loop == "gone"
+
+
+class TestSerial(StopInputConformance):
+    @pytest.fixture
+    def stop_stand(self) -> WiredStand:
+        port = FakePort()
+        return WiredStand(serial_input(port), port)
+
+
+class TestGpio(StopInputConformance):
+    @pytest.fixture
+    def stop_stand(self, gpio: FakeGpio) -> WiredStand:
+        return WiredStand(gpio_input(), gpio)
+
+
+class SimulatedStand(StopInputStand):
+    """The simulator's loop, served from a thread, because the driver's calls block."""
+
+    def __init__(self, path: Path) -> None:
+        self.source = SimulatedStopInput(str(path))
+        self._events = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._events.run_forever, name="stop-loop")
+        self._thread.start()
+        self._loop = StopLoop(path)
+        self.become("closed")
+
+    def become(self, loop: str) -> None:
+        asyncio.run_coroutine_threadsafe(self._loop.become(loop), self._events).result(DEADLINE_S)  # type: ignore[arg-type]
+
+    def end(self) -> None:
+        self.source.close()
+        self.become("gone")
+
+        async def rest() -> None:
+            await asyncio.gather(*(asyncio.all_tasks() - {asyncio.current_task()}), return_exceptions=True)
+
+        asyncio.run_coroutine_threadsafe(rest(), self._events).result(DEADLINE_S)
+        self._events.call_soon_threadsafe(self._events.stop)
+        self._thread.join()
+        self._events.close()
+
+
+class TestSimulated(StopInputConformance):
+    @pytest.fixture
+    def stop_stand(self, tmp_path: Path) -> Iterator[SimulatedStand]:
+        made = SimulatedStand(tmp_path / "stop.sock")
+        yield made
+        made.end()
