@@ -44,9 +44,12 @@ def register(app: typer.Typer) -> None:
 
 def _load(file: Path | None, as_json: bool) -> Config:
     from graderd.config import ConfigError, load
+    from graderd.runtime.app import check_drivers
 
     try:
-        return load(file)
+        config = load(file)
+        check_drivers(config)
+        return config
     except ConfigError as error:
         if as_json:
             print_json({"valid": False, "problems": error.problems})

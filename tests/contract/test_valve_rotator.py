@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import subprocess
 import sys
 import time
 from collections.abc import AsyncIterator, Mapping
@@ -376,6 +377,16 @@ def test_its_settings_are_checked_as_strictly_as_ours(section: dict[str, Any], p
     with pytest.raises(ConfigError) as raised:
         check_plugins(parse({"rotation": {"backend": NAME, **section}}))
     assert problem in str(raised.value)
+
+
+def test_config_check_asks_the_driver_too(tmp_path: Path) -> None:
+    path = tmp_path / "graderd.toml"
+    path.write_text(f'[rotation]\nbackend = "{NAME}"\n[rotation.driver]\nadress_n = 3\n', encoding="utf-8")
+    told = subprocess.run(
+        [sys.executable, "-m", "graderd", "config", "check", str(path)], capture_output=True, text=True
+    )
+    assert told.returncode == 1
+    assert "Did you mean rotation.driver.address_n?" in told.stderr
 
 
 CONFIG: Final = """\
