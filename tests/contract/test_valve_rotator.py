@@ -315,7 +315,7 @@ class ValveStand(RotatorStand):
         self.link = CanLink(
             CanSettings(interface="virtual"), self.clock, bus_factory=lambda: BusPort(self.bus.connect())
         )
-        section = parse({"rotation": {"backend": NAME, "min_deg": self.low, "max_deg": self.high}, **GATE}).rotation
+        section = parse({"rotation": {"backend": NAME, "min_deg": self.low, "max_deg": self.high}}).rotation
         backend, settings = rotator_of(section)
         self._rotator: Rotator = backend.build(settings, Parts(self.clock, self.link))
 
@@ -331,9 +331,6 @@ class ValveStand(RotatorStand):
 
     async def restore_wire(self) -> None:
         self.valve.powered = True
-
-
-GATE: Final = {"gate": {"rotation_min_deg": -45.0, "rotation_max_deg": 45.0}}
 
 
 class TestValveRotator(RotatorConformance):
