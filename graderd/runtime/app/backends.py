@@ -21,6 +21,7 @@ from graderd.drivers.stop_input import GpioStopInput, SerialStopInput
 from graderd.hal.settings import (
     ActuatorSettings,
     CameraSettings,
+    PluginCameraSettings,
     RotatorSettings,
     Settings,
     StopInputSettings,
@@ -69,7 +70,10 @@ def stop_input_of(settings: StopInputSettings) -> tuple[StopInputBackend[Any], A
 
 def plugin_camera_of(settings: CameraSettings) -> tuple[CameraBackend[Any], Any]:
     """The same of ``[camera]``, whose source is a driver from elsewhere."""
-    return _plugin("camera", "source", settings.source, settings, CameraBackend)
+    # The configuration's section has the calibration too, which is perception's.
+    of_camera = settings.model_dump(include=set(PluginCameraSettings.model_fields))
+    section = PluginCameraSettings.model_validate(of_camera)
+    return _plugin("camera", "source", settings.source, section, CameraBackend)
 
 
 def check_plugins(config: Config) -> None:
