@@ -17,10 +17,11 @@ from graderd.core.lift import LiftCoordinator, height_mm
 from graderd.core.lift_pair import SideReading
 from graderd.core.machine import ARMED, Inputs, Intents, Mode, Pose, State, step
 from graderd.core.motion import resolve
+from graderd.core.plausibility import PlausibilityMonitor, axis_figures
 from graderd.core.soil import SoilObservation
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceError
-from graderd.hal.fault import DeviceFault
+from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.reading import Reading
 from graderd.runtime.devices import ACTUATOR_NAMES, Devices, PowerSequencer
@@ -31,7 +32,6 @@ MAX_COMMANDS_PER_TICK = 32
 LATENESS_WINDOW_N = 500
 BLOCKED_S = 0.5
 """A tick this late: goals have timed out and the servo's watchdog (0.2 s by default) has tripped meanwhile."""
-OVERRUN_SHOWN_S = 1.0
 LAPSE_SHOWN_S = 3.0
 
 log = logging.getLogger(__name__)
@@ -82,11 +82,12 @@ class ControlLoop:
         self._state_file = state_file
         self._gate = GateState()
         self._lift = LiftCoordinator(config.lift_pair)
+        speeds = {axis: limit.speed for axis, limit in config.gate.limits().items()}
+        self._plausibility = PlausibilityMonitor(axis_figures(config.rotation, speeds))
         self._power = PowerSequencer(devices)
         self._queue: deque[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = deque()
         self._moving: set[str] = set()
-        self._late: tuple[float, float] | None = None
-        self._lapse: tuple[str, float] | None = None
+        self._own_faults = PresentFaults("daemon")
 
     # ---- commands -------------------------------------------------------------------------------------------------
 
@@ -115,7 +116,9 @@ class ControlLoop:
                 self.lateness_s.append(max(0.0, late_s))
                 if late_s > self.config.control.overrun_s:
                     self.overruns_n += 1
-                    self._note_late(late_s, self._clock.now_s())
+                    condition = "loop_blocked" if late_s > BLOCKED_S else "tick_overrun"
+                    detail = f"tick {late_s * 1e3:.0f} ms late, {self.overruns_n} overruns"
+                    self._own_faults.tell(condition, detail, self._clock.now_s())
                 self.tick()
                 due_s = max(due_s + period_s, self._clock.now_s())
                 await asyncio.sleep(max(0.0, due_s - self._clock.now_s()))
@@ -263,17 +266,12 @@ class ControlLoop:
         found: list[DeviceFault] = [*self.devices.link.faults(), *self._eyes.faults(), *self._lift.faults()]
         for device in self.devices.all().values():
             found.extend(device.faults())
+        found.extend(self._plausibility.judge(self.devices.axis_samples(), now_s))
         for source in self.extra_faults:
             found.extend(source(now_s))
-        if self._late is not None and now_s - self._late[1] < OVERRUN_SHOWN_S:
-            late_s, at_s = self._late
-            detail = f"tick {late_s * 1e3:.0f} ms late, {self.overruns_n} overruns"
-            found.append(DeviceFault("daemon", "loop_blocked" if late_s > BLOCKED_S else "tick_overrun", detail, at_s))
-        if self._lapse is not None and now_s - self._lapse[1] < LAPSE_SHOWN_S:
-            found.append(DeviceFault("daemon", "lease_lapsed", f"client {self._lapse[0] or '?'}", self._lapse[1]))
-        if self._state_file.problem:
-            found.append(DeviceFault("daemon", "state_file_corrupt", self._state_file.problem, now_s))
-        return found
+        problem = self._state_file.problem
+        self._own_faults.keep("state_file_corrupt", bool(problem), problem, now_s)
+        return [*found, *self._own_faults.present(now_s)]
 
     def _note_transition(self, before: State, after: State) -> None:
         if before.mode is after.mode:
@@ -286,15 +284,10 @@ class ControlLoop:
             self._gate = GateState()
             self.faults = clear_faults(self.faults, Clear.ON_REARM)
 
-    def _note_late(self, late_s: float, now_s: float) -> None:
-        """The worst of the last moments is told: small delays after a long one must not hide it."""
-        if self._late is None or late_s >= self._late[0] or now_s - self._late[1] > OVERRUN_SHOWN_S:
-            self._late = (late_s, now_s)
-
     def _note_lapse(self, before: State, after: State, now_s: float) -> None:
         lapsed = before.lease is not None and after.lease is None and now_s > before.lease.expires_s
         if lapsed and before.lease is not None and after.mode in ARMED:
-            self._lapse = (before.lease.client, now_s)
+            self._own_faults.tell("lease_lapsed", f"client {before.lease.client or '?'}", now_s, LAPSE_SHOWN_S)
 
     def _clear_latches(self, commands: tuple[cmd.Command, ...]) -> None:
         """A reset or an arm lets go of latched faults whose cause is gone; what is still there stays and refuses."""

@@ -11,11 +11,13 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from graderd.core.plausibility import AxisSample
 from graderd.hal.errors import DeviceError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.linear_actuator import LinearActuator
-from graderd.hal.rotator import Rotator
+from graderd.hal.linear_actuator import ActuatorTelemetry, LinearActuator
+from graderd.hal.reading import Reading
+from graderd.hal.rotator import Rotator, RotatorTelemetry
 
 ACTUATOR_NAMES = ("lift_left", "lift_right", "tilt")
 
@@ -66,6 +68,15 @@ class Devices:
         """The axes by device name."""
         return {"rotation": self.rotation, **self.actuators}
 
+    def axis_samples(self) -> tuple[AxisSample, ...]:
+        """What each axis does and was told, for the judgement of its motion; an axis without a valid position: none."""
+        turns = self.rotation.telemetry()
+        found = [_sample("rotation", self.rotation, turns.angle_deg, turns.velocity_deg_per_s, turns.goal_deg, turns)]
+        for name, actuator in self.actuators.items():
+            told = actuator.telemetry()
+            found.append(_sample(name, actuator, told.position_mm, told.velocity_mm_per_s, told.goal_mm, told))
+        return tuple(sample for sample in found if sample is not None)
+
     def hold_all(self) -> tuple[str, ...]:
         """Ask every axis to stop where it is, each in its own try; returns the axes whose driver raised."""
         failed = []
@@ -75,6 +86,27 @@ class Devices:
             except Exception:  # the stop path goes on to the next device whatever this one raised
                 failed.append(name)
         return tuple(failed)
+
+
+def _sample(
+    name: str,
+    device: Rotator | LinearActuator,
+    position: Reading[float] | None,
+    velocity: Reading[float] | None,
+    goal: float | None,
+    told: RotatorTelemetry | ActuatorTelemetry,
+) -> AxisSample | None:
+    if position is None or not position.valid:
+        return None
+    return AxisSample(
+        name=name,
+        position=position.value,
+        time_s=position.time_s,
+        velocity=None if velocity is None else velocity.value,
+        goal=goal,
+        powered=device.lifecycle is Lifecycle.ACTIVE,
+        current_a=None if told.current_a is None else told.current_a.value,
+    )
 
 
 log = logging.getLogger(__name__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from graderd.drivers.dynamixel.ph54 import Ph54Rotator
 from graderd.drivers.dynamixel.serial_port import latency_timer_ms
-from graderd.hal.fault import DeviceFault
+from graderd.hal.fault import DeviceFault, PresentFaults
 
 WANTED_MS = 1
 
@@ -15,7 +15,7 @@ class AdapterWatch:
     def __init__(self, rotator: Ph54Rotator) -> None:
         self._rotator = rotator
         self._port: str | None = None
-        self._slow: DeviceFault | None = None
+        self._faults = PresentFaults("servo_bus")
 
     def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """``servo_bus.adapter_latency`` while the present adapter holds bytes back."""
@@ -25,5 +25,5 @@ class AdapterWatch:
             timer_ms = latency_timer_ms(port) if port is not None else None
             detail = f"{port}: latency timer {timer_ms} ms, {WANTED_MS} ms is wanted"
             slow = timer_ms is not None and timer_ms > WANTED_MS
-            self._slow = DeviceFault("servo_bus", "adapter_latency", detail, now_s) if slow else None
-        return (self._slow,) if self._slow is not None else ()
+            self._faults.keep("adapter_latency", slow, detail, now_s)
+        return self._faults.present(now_s)
