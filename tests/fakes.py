@@ -20,6 +20,7 @@ class FakeAxis:
         self.name = name
         self.clock = clock
         self.position = position
+        self.goal: float | None = None
         self.log = log
         self.lifecycle = Lifecycle.STANDBY
         self.present: list[DeviceFault] = []
@@ -45,11 +46,13 @@ class FakeAxis:
         if not -400 < goal < 400:
             raise CommandRangeError(self.name, "beyond")
         self.log.append(f"{self.name} goal {goal:.3f}")
+        self.goal = goal
         if not self.stuck:
             self.position = goal
 
     def hold(self) -> None:
         self.log.append(f"{self.name} hold")
+        self.goal = None
         self.held_n += 1
         if self.hold_raises:
             raise RuntimeError("driver bug")
@@ -66,6 +69,7 @@ class FakeAxis:
 
     async def disarm(self) -> None:
         self.lifecycle = Lifecycle.STANDBY
+        self.goal = None
         self.log.append(f"{self.name} disarm")
 
     async def close(self) -> None:
@@ -77,7 +81,7 @@ class FakeRotator(FakeAxis):
     """A rotator that is where it was told to be."""
 
     def telemetry(self) -> RotatorTelemetry:
-        return RotatorTelemetry(angle_deg=self.reading())
+        return RotatorTelemetry(angle_deg=self.reading(), goal_deg=self.goal)
 
     def set_goal_deg(self, goal_deg: float) -> None:
         self.go(goal_deg)
@@ -87,7 +91,7 @@ class FakeActuator(FakeAxis):
     """An actuator that is where it was told to be."""
 
     def telemetry(self) -> ActuatorTelemetry:
-        return ActuatorTelemetry(position_mm=self.reading())
+        return ActuatorTelemetry(position_mm=self.reading(), goal_mm=self.goal)
 
     def set_target_mm(self, target_mm: float, speed_share: float = 1.0) -> None:
         assert 0.0 < speed_share <= 1.0

@@ -142,7 +142,7 @@ class ElectrakActuator:
             raise LifecycleError(self.name, f"cannot open while {self._lifecycle}", "Close it first")
         await self._link.open()
         now_s = self._clock.now_s()
-        self._forget(now_s)
+        self._forget()
         self._opened_at_s = now_s
         self._link.attach(self)
         try:
@@ -355,7 +355,7 @@ class ElectrakActuator:
             self._lifecycle = Lifecycle.FAILED
             self.hold()
 
-    def _forget(self, now_s: float) -> None:
+    def _forget(self) -> None:
         self._planner.hold()
         self._monitor.reset()
         self._faults.clear_all()

@@ -170,7 +170,7 @@ class _AxisWatch:
         self._goal_since_s = self._move_s = 0.0
         self._mark = self._mark_s = 0.0
         self._direction = 0.0
-        self._furthest = self._furthest_s = self._braking_s = 0.0
+        self._furthest = self._furthest_s = self._most_away = self._braking_s = 0.0
         self._way_from = self._way_since_s = self._way_goal = 0.0
 
     def judge(self, sample: AxisSample | None, now_s: float) -> tuple[DeviceFault, ...]:
@@ -215,6 +215,8 @@ class _AxisWatch:
             self._rest = None
             self._goal, self._goal_since_s = goal, now_s
             self._move_s = self._duration_s(abs(goal - s.position), abs(self._velocity))
+            if abs(goal - s.position) > self._figures.near:
+                self._turn(s, goal)
 
     def _duration_s(self, way: float, speed: float) -> float:
         """How long a move takes at the device's own speed, braking from a speed in the wrong direction first."""
@@ -270,28 +272,29 @@ class _AxisWatch:
             return
         if self._rest is not None and self._displaced(s, self._rest, self._figures.tolerance, "away from its goal"):
             self._rest = None
-        self._turn(s, goal, error)
+        self._turn(s, goal)
         self._away(s, error)
         if not self._stuck(s, error):
             self._arriving(s, goal, error)
 
-    def _turn(self, s: AxisSample, goal: float, error: float) -> None:
-        """A goal on the other side: the axis is given the time to brake."""
-        direction = math.copysign(1.0, error)
+    def _turn(self, s: AxisSample, goal: float) -> None:
+        """Where its goal lies; one on the other side of a moving axis is legal, and leaves it the time to brake."""
+        direction = math.copysign(1.0, goal - s.position)
         if direction == self._direction:
             return
-        opposed = -direction * self._velocity
-        figures = self._figures
-        self._braking_s = figures.reaction_s + figures.braking_s(opposed) if opposed > figures.still else 0.0
+        figures, opposed = self._figures, -direction * self._velocity
         self._direction = direction
-        self._furthest, self._furthest_s = s.position, s.time_s
+        self._furthest, self._furthest_s, self._most_away = s.position, s.time_s, 0.0
+        self._braking_s = figures.reaction_s + figures.braking_s(opposed) if opposed > figures.still else 0.0
         self._way_from, self._way_since_s, self._way_goal = s.position, s.time_s, goal
 
     def _away(self, s: AxisSample, error: float) -> None:
         figures = self._figures
         away = (self._furthest - s.position) * self._direction
-        if away < 0.0:
-            self._furthest, self._braking_s = s.position, 0.0
+        self._most_away = max(self._most_away, away)
+        if away < 0.0 or away < self._most_away - figures.moved:
+            # It obeys: what it does from here on is not the braking of what it did before.
+            self._furthest, self._most_away, self._braking_s, away = s.position, 0.0, 0.0, 0.0
         if away <= figures.moved and not self._braking_s:
             self._furthest_s = s.time_s
         lasted_s = s.time_s - self._furthest_s

@@ -226,7 +226,7 @@ def test_heat_brings_rests_before_the_limit_and_the_limit_is_not_reached() -> No
                 await keep_asking(axis, 285.0 if unit.position_mm < 150.0 else 6.0, 1.0)
                 unit.position_mm = 60.0
                 seen |= conditions(axis)
-                axis._monitor.reset(loop.now_s())
+                axis._monitor.reset()
                 if state(axis) is Lifecycle.STANDBY:
                     await axis.arm()
             assert "thermal_derating" in seen
