@@ -15,9 +15,11 @@ from typing import Any
 
 import pytest
 
+from graderd.core.plausibility import PlausibilityMonitor, axis_figures
 from graderd.drivers.dynamixel import Ph54Rotator
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import RotatorSettings
+from graderd.runtime.devices import rotation_sample
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
 from tests.awake_clock import AwakeClock
 
@@ -27,15 +29,19 @@ PATIENCE_S = 15.0
 
 @dataclass
 class Bench:
-    """A rotator and the virtual servo it drives."""
+    """A rotator and the virtual servo it drives, with the daemon's judgement of its motion."""
 
     rotator: Ph54Rotator
     servo: VirtualServo
     bus: VirtualServoBus
     clock: AwakeClock
+    monitor: PlausibilityMonitor
 
     def conditions(self) -> set[str]:
-        return {f.condition for f in self.rotator.faults()}
+        """What the driver tells, and what the readings say about the motion."""
+        sample = rotation_sample(self.rotator)
+        judged = self.monitor.judge(() if sample is None else (sample,), self.clock.now_s())
+        return {f.condition for f in (*self.rotator.faults(), *judged)}
 
     async def until(self, met: Callable[[], object], what: str = "", timeout_s: float = PATIENCE_S) -> None:
         """Wait until ``met()`` is true, looking every few milliseconds."""
@@ -117,7 +123,8 @@ async def bench(
     try:
         if opened:
             await rotator.open()
-        yield Bench(rotator, servo, bus, clock)
+        speeds = {"rotation": settings.velocity_deg_per_s}
+        yield Bench(rotator, servo, bus, clock, PlausibilityMonitor(axis_figures(settings, speeds)))
     finally:
         await rotator.close()
         await bus.close()

@@ -15,9 +15,9 @@ from graderd.core.plausibility import AxisSample
 from graderd.hal.errors import DeviceError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.linear_actuator import ActuatorTelemetry, LinearActuator
+from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.reading import Reading
-from graderd.hal.rotator import Rotator, RotatorTelemetry
+from graderd.hal.rotator import Rotator
 
 ACTUATOR_NAMES = ("lift_left", "lift_right", "tilt")
 
@@ -70,11 +70,7 @@ class Devices:
 
     def axis_samples(self) -> tuple[AxisSample, ...]:
         """What each axis does and was told, for the judgement of its motion; an axis without a valid position: none."""
-        turns = self.rotation.telemetry()
-        found = [_sample("rotation", self.rotation, turns.angle_deg, turns.velocity_deg_per_s, turns.goal_deg, turns)]
-        for name, actuator in self.actuators.items():
-            told = actuator.telemetry()
-            found.append(_sample(name, actuator, told.position_mm, told.velocity_mm_per_s, told.goal_mm, told))
+        found = (rotation_sample(self.rotation), *(actuator_sample(n, a) for n, a in self.actuators.items()))
         return tuple(sample for sample in found if sample is not None)
 
     def hold_all(self) -> tuple[str, ...]:
@@ -88,25 +84,35 @@ class Devices:
         return tuple(failed)
 
 
+def rotation_sample(rotator: Rotator) -> AxisSample | None:
+    """What the rotation does and was told, in degrees; None without a valid angle."""
+    told = rotator.telemetry()
+    powered = rotator.lifecycle is Lifecycle.ACTIVE
+    return _sample("rotation", told.angle_deg, told.velocity_deg_per_s, told.goal_deg, powered, told.current_a)
+
+
+def actuator_sample(name: str, actuator: LinearActuator) -> AxisSample | None:
+    """What an actuator does and was told, in millimetres; None without a valid position."""
+    told = actuator.telemetry()
+    powered = actuator.lifecycle is Lifecycle.ACTIVE
+    return _sample(name, told.position_mm, told.velocity_mm_per_s, told.goal_mm, powered, told.current_a)
+
+
 def _sample(
     name: str,
-    device: Rotator | LinearActuator,
     position: Reading[float] | None,
     velocity: Reading[float] | None,
     goal: float | None,
-    told: RotatorTelemetry | ActuatorTelemetry,
+    powered: bool,
+    current_a: Reading[float] | None,
 ) -> AxisSample | None:
     if position is None or not position.valid:
         return None
-    return AxisSample(
-        name=name,
-        position=position.value,
-        time_s=position.time_s,
-        velocity=None if velocity is None else velocity.value,
-        goal=goal,
-        powered=device.lifecycle is Lifecycle.ACTIVE,
-        current_a=None if told.current_a is None else told.current_a.value,
-    )
+    return AxisSample(name, position.value, position.time_s, _of(velocity), goal, powered, _of(current_a))
+
+
+def _of(reading: Reading[float] | None) -> float | None:
+    return None if reading is None else reading.value
 
 
 log = logging.getLogger(__name__)

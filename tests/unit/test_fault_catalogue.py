@@ -29,8 +29,8 @@ ROOT = Path(__file__).resolve().parents[2]
 CONDITIONS = {
     "rotation": (
         "no_reply corrupt_replies wrong_device alert_voltage alert_hall_sensor alert_overheating alert_encoder "
-        "alert_electrical_shock alert_overload watchdog_tripped ram_reset turns_lost torque_off not_moving not_arriving "
-        "overspeed moving_uncommanded wrong_way voltage_near_limit temperature_near_limit unplugged"
+        "alert_electrical_shock alert_overload watchdog_tripped ram_reset turns_lost torque_off not_moving "
+        "not_arriving overspeed moving_uncommanded wrong_way voltage_near_limit temperature_near_limit unplugged"
     ),
     "servo_bus": "adapter_latency",
     "actuator": (
