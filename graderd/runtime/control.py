@@ -116,9 +116,7 @@ class ControlLoop:
                 self.lateness_s.append(max(0.0, late_s))
                 if late_s > self.config.control.overrun_s:
                     self.overruns_n += 1
-                    condition = "loop_blocked" if late_s > BLOCKED_S else "tick_overrun"
-                    detail = f"tick {late_s * 1e3:.0f} ms late, {self.overruns_n} overruns"
-                    self._own_faults.tell(condition, detail, self._clock.now_s())
+                    self._note_late(late_s, self._clock.now_s())
                 self.tick()
                 due_s = max(due_s + period_s, self._clock.now_s())
                 await asyncio.sleep(max(0.0, due_s - self._clock.now_s()))
@@ -283,6 +281,10 @@ class ControlLoop:
         elif after.mode in ARMED and before.mode not in ARMED:
             self._gate = GateState()
             self.faults = clear_faults(self.faults, Clear.ON_REARM)
+
+    def _note_late(self, late_s: float, now_s: float) -> None:
+        detail = f"tick {late_s * 1e3:.0f} ms late, {self.overruns_n} overruns"
+        self._own_faults.tell("loop_blocked" if late_s > BLOCKED_S else "tick_overrun", detail, now_s)
 
     def _note_lapse(self, before: State, after: State, now_s: float) -> None:
         lapsed = before.lease is not None and after.lease is None and now_s > before.lease.expires_s
