@@ -103,7 +103,7 @@ def axis_figures(rotation: RotatorSettings, speeds: Mapping[str, float]) -> dict
                 tolerance=2.0,
                 still=1.0,
                 reaction_s=0.25,
-                rest_s=0.4,
+                rest_s=0.3,
                 moved=0.5,
                 not_moving_s=0.7,
                 not_arriving_s=2.8,
