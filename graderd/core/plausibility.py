@@ -185,11 +185,11 @@ class _AxisWatch:
             # Also between two readings: a goal given and taken back meanwhile has moved the axis all the same.
             self._follow(sample, last, now_s)
             if new:
-                self._speed(sample, last)
+                too_fast = self._too_fast(sample, last)
                 if self._goal is None:
                     self._held(sample)
                 else:
-                    self._driven(sample, self._goal)
+                    self._driven(sample, self._goal, too_fast)
         return self._faults.present(now_s)
 
     # -- what it was told -------------------------------------------------------------------------------------------
@@ -230,19 +230,20 @@ class _AxisWatch:
 
     # -- judgement --------------------------------------------------------------------------------------------------
 
-    def _speed(self, s: AxisSample, last: AxisSample | None) -> None:
+    def _too_fast(self, s: AxisSample, last: AxisSample | None) -> bool:
         """The way gained on what is permitted: it grows while the axis is too fast and shrinks while it is not."""
         if last is None:
-            return
+            return False
         permitted = _OVERSPEED_FACTOR * self._figures.speed
         moved, took_s = s.position - last.position, s.time_s - last.time_s
         self._gained = max(0.0, self._gained + abs(moved) - permitted * took_s)
-        if self._gained > self._figures.overspeed_margin:
-            # Told anew only after another margin, so that it ends a second after the speed did.
-            self._gained = 0.0
-            unit = self._unit
-            detail = f"{abs(moved) / took_s:.0f}{unit}/s, {self._figures.speed:g}{unit}/s are permitted"
-            self._faults.tell("overspeed", detail, s.time_s)
+        if self._gained <= self._figures.overspeed_margin:
+            return False
+        self._gained = 0.0  # told anew only after another margin, so that it ends a second after the speed did
+        unit = self._unit
+        detail = f"{abs(moved) / took_s:.0f}{unit}/s, {self._figures.speed:g}{unit}/s are permitted"
+        self._faults.tell("overspeed", detail, s.time_s)
+        return True
 
     def _held(self, s: AxisSample) -> None:
         """Displacement from where it was held; while it may still be braking, more than that can take it."""
@@ -262,7 +263,7 @@ class _AxisWatch:
         self._faults.tell(self._uncommanded, f"moved {moved:+.1f}{self._unit} {how}{_at(s)}", s.time_s)
         return True
 
-    def _driven(self, s: AxisSample, goal: float) -> None:
+    def _driven(self, s: AxisSample, goal: float, too_fast: bool) -> None:
         error = goal - s.position
         if abs(error) <= self._figures.near:
             self._mark, self._mark_s = s.position, s.time_s
@@ -273,7 +274,7 @@ class _AxisWatch:
         if self._rest is not None and self._displaced(s, self._rest, self._figures.tolerance, "away from its goal"):
             self._rest = None
         self._turn(s, goal)
-        self._away(s, error)
+        self._away(s, error, too_fast)
         if not self._stuck(s, error):
             self._arriving(s, goal, error)
 
@@ -288,7 +289,7 @@ class _AxisWatch:
         self._braking_s = figures.reaction_s + figures.braking_s(opposed) if opposed > figures.still else 0.0
         self._way_from, self._way_since_s, self._way_goal = s.position, s.time_s, goal
 
-    def _away(self, s: AxisSample, error: float) -> None:
+    def _away(self, s: AxisSample, error: float, too_fast: bool) -> None:
         figures = self._figures
         away = (self._furthest - s.position) * self._direction
         self._most_away = max(self._most_away, away)
@@ -299,8 +300,10 @@ class _AxisWatch:
             self._furthest_s = s.time_s
         lasted_s = s.time_s - self._furthest_s
         allowed_s = figures.wrong_way_s + self._braking_s
-        # No permitted speed takes further to brake: a runaway is not given the time that braking would take.
-        if (away > figures.wrong_way and lasted_s >= allowed_s) or away > figures.wrong_way + figures.overrun:
+        # A runaway is not given the time that braking would take: nobody brakes from a speed that is not permitted,
+        # and no permitted one takes so far.
+        runaway = too_fast or away > figures.wrong_way + figures.overrun
+        if away > figures.wrong_way and (lasted_s >= allowed_s or runaway):
             unit = self._unit
             detail = f"went {away:.1f}{unit} away from its goal in {lasted_s:.2f} s, {error:+.1f}{unit} to go{_at(s)}"
             self._faults.tell(self._wrong_way, detail, s.time_s)

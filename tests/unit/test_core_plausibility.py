@@ -223,6 +223,11 @@ def test_a_runaway_under_a_goal_is_named_before_braking_could_be_over() -> None:
     assert 60.0 * (seen["wrong_way"] - 1.0) < 14.5
 
 
+def test_a_runaway_faster_than_permitted_is_the_wrong_way_at_once() -> None:
+    seen = watch("rotation", ramp(-130.0), to(20.0, before=0.0), 3.0)
+    assert seen["wrong_way"] == seen["overspeed"] < 1.07
+
+
 # -- uncommanded ------------------------------------------------------------------------------------------------------
 
 
