@@ -2,25 +2,65 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
+LOCKED := $(VENV)/.locked
 STAMP  := $(VENV)/.installed
+# Seconds instead of a minute or so where it is on PATH; `make UV=` does without.
+ifeq ($(origin UV),undefined)
+UV     := $(shell uv --version >/dev/null 2>&1 && echo uv)
+endif
 ARGS   ?=
 PYTEST_ARGS ?=
 DEB_ARGS ?=
 HIL_ARGS ?=
 BENCH_ARGS ?=
+LOCK_ARGS ?=
+PYTHONS ?= 3.11 3.12 3.13
+PYTHON_TARGETS ?= run test
+# Any that is there; pyenv's names on PATH start only the version that PYENV_VERSION names.
+FIND_PYTHON = PYENV_VERSION=$* $(BIN)/uv python find --system --no-python-downloads
 SOAK_S ?= 900
 
-.PHONY: help run test faults deb hil soak soak-virtual-time hil-package hil-arm64 hil-usb bench-hw check format lock clean
+.PHONY: help run test quick test-pythons faults deb hil soak soak-virtual-time hil-package hil-arm64 hil-usb bench-hw check format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
 
-$(STAMP): requirements.lock pyproject.toml
-	@echo "setting up $(VENV) (once; some minutes on a slow line)" >&2
+# The lock is installed as it stands: no resolver looks at an index (pip 22.2 to 23.0.1 would resolve it again and meet
+# what is newest), nothing is compiled, each file has a hash of the lock, and `check` judges the whole. The environment
+# is made anew when the lock changed or a set-up was interrupted, so it never holds what the lock does not name.
+ifeq ($(UV),)
+INSTALL := $(BIN)/python -m pip --disable-pip-version-check --quiet install --no-deps
+AGREES  := $(BIN)/python -m pip --disable-pip-version-check check
+else
+INSTALL := $(UV) pip install --python $(BIN)/python --quiet --no-deps
+AGREES  := $(UV) pip check --python $(BIN)/python
+endif
+# A tool's own words are shown when it fails, and what they come to.
+LOG    := $(VENV)/set-up.log
+define because
+{ cat $(LOG) >&2; case "$$(cat $(LOG))" in \
+*"DO NOT MATCH THE HASHES"* | *"Hash mismatch"*) why="a file is not the one that requirements.lock names: broken on its way, or changed on the index; empty the cache (pip cache purge, uv cache clean) and make again, and if it stays, take another index" ;; \
+*[Cc]onnect* | *"timed out"* | *"dns error"*) why="the package index is not reached; look at the network, HTTPS_PROXY and PIP_INDEX_URL (UV_DEFAULT_INDEX for uv), then make again" ;; \
+*"No space left"*) why="the disk is full; make room (300 MB to download, 1 GB in $(VENV)), then make again" ;; \
+*"No matching distribution"* | *"No solution found"*) why="the index has no wheel of a pinned version for this Python on this machine; README says which have all (make PYTHON=/path/to/python3), or the index is not a whole one" ;; \
+*) why="the cause stands above" ;; \
+esac; echo "set-up of $(VENV) by $(if $(UV),uv,pip): $$why" >&2; exit 1; }
+endef
+# A Python that the system replaced leaves an environment without one.
+ifneq ($(shell test -x $(BIN)/python && echo here),here)
+.PHONY: $(LOCKED)
+endif
+
+$(LOCKED): requirements.lock
+	@echo "setting up $(VENV) with $(if $(UV),uv,pip) (once; some minutes on a slow line)" >&2
 	@$(PYTHON) -c 'import sys; sys.exit("graderd needs Python 3.11 or newer; make PYTHON=/path/to/python3.11") if sys.version_info < (3, 11) else None'
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@$(PYTHON) -m venv --clear $(VENV)
+	@$(INSTALL) --only-binary :all: --require-hashes -r $< >$(LOG) 2>&1 || $(because)
+	@touch $@
+
+$(STAMP): $(LOCKED) pyproject.toml
+	@$(INSTALL) --no-build-isolation --editable . >$(LOG) 2>&1 || $(because)
+	@$(AGREES) >$(LOG) 2>&1 || { cat $(LOG) >&2; echo "set-up of $(VENV): requirements.lock and pyproject.toml do not agree; make lock" >&2; exit 1; }
 	@touch $@
 
 run: $(STAMP) ## drive the demonstration on the simulated grader (ARGS=--json for one object a line)
@@ -29,6 +69,16 @@ run: $(STAMP) ## drive the demonstration on the simulated grader (ARGS=--json fo
 test: $(STAMP) ## run the tests
 	@$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not serial_only" $(PYTEST_ARGS)
 	@$(BIN)/python -m pytest -m serial_only $(PYTEST_ARGS)
+
+quick: $(STAMP) ## run the tests of functions, contracts and wires that take no ten seconds each
+	@$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not serial_only and not slow" $(PYTEST_ARGS) tests/unit tests/contract tests/wire
+
+test-pythons: $(PYTHONS:%=test-python-%) ## both commands on each Python that README names, one after the other
+
+test-python-%: $(STAMP)
+	@python=$$($(FIND_PYTHON) $* 2>/dev/null || { $(BIN)/uv python install --quiet $* >&2 && $(FIND_PYTHON) $*; }) \
+	|| { echo "test-pythons: no Python $* on this machine, nor can uv download one; install it, or PYTHONS=\"...\" for the others" >&2; exit 1; }; \
+	$(MAKE) --no-print-directory VENV=.venv-$* PYTHON=$$python $(PYTHON_TARGETS)
 
 faults: $(STAMP) ## inject every fault in every phase of work (ARGS="--short --json" for a part of it)
 	@$(BIN)/python -m tests.fault.campaign $(ARGS)
@@ -86,8 +136,8 @@ format: $(STAMP) ## apply the formatter and the safe fixes
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
-lock: $(STAMP) ## pin every dependency again (needs uv on PATH)
-	uv pip compile --universal --python-version 3.11 --all-extras --generate-hashes --custom-compile-command "make lock" -q -o requirements.lock pyproject.toml
+lock: $(LOCKED) ## pin what pyproject.toml names; pins in force stay (LOCK_ARGS="--upgrade-package numpy", --upgrade for all)
+	@$(BIN)/uv pip compile --universal --python-version 3.11 --all-extras --generate-hashes --custom-compile-command "make lock" --quiet --output-file requirements.lock $(LOCK_ARGS) pyproject.toml
 
 clean: ## remove what the targets above made
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(PYTHONS:%=.venv-%) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

@@ -15,11 +15,11 @@ from typing import Any
 
 import pytest
 
-from graderd.core.plausibility import PlausibilityMonitor, axis_figures
+from graderd.config import Config
+from graderd.core.plausibility import PlausibilityMonitor, axis_sample, motion_figures
 from graderd.drivers.dynamixel import Ph54Rotator
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import RotatorSettings
-from graderd.runtime.devices import rotation_sample
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
 from tests.awake_clock import AwakeClock
 
@@ -39,7 +39,7 @@ class Bench:
 
     def conditions(self) -> set[str]:
         """What the driver tells, and what the readings say about the motion."""
-        sample = rotation_sample(self.rotator)
+        sample = axis_sample("rotation", self.rotator.lifecycle, self.rotator.telemetry())
         judged = self.monitor.judge(() if sample is None else (sample,), self.clock.now_s())
         return {f.condition for f in (*self.rotator.faults(), *judged)}
 
@@ -116,15 +116,15 @@ async def bench(
     servo = servo or VirtualServo()
     clock = AwakeClock()
     bus = VirtualServoBus([servo], folder / "servo", clock=clock, **(wire or {}))
-    brisk = {"velocity_deg_per_s": 60.0, "acceleration_deg_per_s2": 240.0}  # so that tests need not wait for the blade
+    brisk = {"speed_deg_per_s": 50.0, "acceleration_deg_per_s2": 200.0}  # so that tests need not wait for the blade
     settings = RotatorSettings(**{"port": str(folder / "servo"), **brisk, **changes})
     rotator = Ph54Rotator(settings, clock=clock)
     await bus.start()
     try:
         if opened:
             await rotator.open()
-        speeds = {"rotation": settings.velocity_deg_per_s}
-        yield Bench(rotator, servo, bus, clock, PlausibilityMonitor(axis_figures(settings, speeds)))
+        figures = Config(rotation=settings).figures()
+        yield Bench(rotator, servo, bus, clock, PlausibilityMonitor(motion_figures(settings, figures)))
     finally:
         await rotator.close()
         await bus.close()

@@ -7,16 +7,15 @@ import selectors
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
+from graderd.config import Config
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import Reaction, row_for
-from graderd.core.gate import GateSettings
-from graderd.core.plausibility import PlausibilityMonitor, axis_figures
+from graderd.core.plausibility import PlausibilityMonitor, axis_sample, motion_figures
 from graderd.drivers.electrak import CanLink, ElectrakActuator
 from graderd.drivers.j1939.can_port import BusPort
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.settings import ActuatorSettings, CanSettings, RotatorSettings
-from graderd.runtime.devices import actuator_sample
+from graderd.hal.settings import ActuatorSettings, CanSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 
 T = TypeVar("T")
@@ -156,10 +155,10 @@ class Machine:
         return {fault.condition for fault in (*self.axes[name].faults(), *judged)}
 
     async def _watch(self) -> None:
-        speeds = {axis: limit.speed for axis, limit in GateSettings().limits().items()}
-        monitor = PlausibilityMonitor(axis_figures(RotatorSettings(), speeds))
+        config = Config()
+        monitor = PlausibilityMonitor(motion_figures(config.rotation, config.figures()))
         while True:
-            samples = [actuator_sample(name, axis) for name, axis in self.axes.items()]
+            samples = [axis_sample(name, axis.lifecycle, axis.telemetry()) for name, axis in self.axes.items()]
             self.judged = monitor.judge((sample for sample in samples if sample is not None), self.clock.now_s())
             for fault in self.judged:
                 if row_for(fault, CATALOGUE).reaction is Reaction.DISARM:

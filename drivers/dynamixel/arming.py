@@ -24,8 +24,8 @@ def watchdog_counts(settings: RotatorSettings) -> int:
 def profile_counts(settings: RotatorSettings, calibration: Calibration, factor: float = 1.0) -> dict[str, int]:
     """Profile registers of a move, its acceleration times ``factor``."""
     return {
-        "profile_acceleration": calibration.acceleration_counts(settings.acceleration_deg_per_s2 * factor),
-        "profile_velocity": calibration.velocity_counts(settings.velocity_deg_per_s),
+        "profile_acceleration": calibration.acceleration_counts(settings.profile_acceleration_deg_per_s2 * factor),
+        "profile_velocity": calibration.velocity_counts(settings.profile_velocity_deg_per_s),
     }
 
 
@@ -79,7 +79,7 @@ async def _power_up(device: Ph54Device, settings: RotatorSettings, calibration: 
         raise DeviceRefusedError(
             device.where,
             f"profile {profile} is above the servo's own velocity or acceleration limit {top}",
-            "Lower rotation.velocity_deg_per_s or rotation.acceleration_deg_per_s2, or raise the servo's limits",
+            "Lower rotation.speed_deg_per_s or rotation.acceleration_deg_per_s2, or raise the servo's limits",
         )
     measured = await _measure(device, calibration)
     goal = {

@@ -103,7 +103,7 @@ async def step_response(
             await _dwell(rotator, goal_deg, dwell_s, began_s, samples, reference_deg)
     finally:
         rotator.hold()
-    return analyse(samples, rotator.settings.in_position_deg, _settings_used(rotator))
+    return analyse(samples, rotator.settings.tolerance_deg, _settings_used(rotator))
 
 
 async def _dwell(
@@ -204,13 +204,13 @@ def _settings_used(rotator: Ph54Rotator) -> dict[str, str]:
     s = rotator.settings
     return {
         "servo": f"{rotator.table.title}, firmware {rotator.firmware_version}",
-        "velocity": f"{s.velocity_deg_per_s:g} °/s",
-        "acceleration": f"{s.acceleration_deg_per_s2:g} °/s²",
+        "velocity": f"{s.profile_velocity_deg_per_s:g} °/s",
+        "acceleration": f"{s.profile_acceleration_deg_per_s2:g} °/s²",
         "current limit": f"{s.current_limit_a:g} A",
         "gear ratio": f"{s.gear_ratio:g}",
         "zero and sign": f"{s.zero_deg:g}°, {s.sign:+d}",
         "poll rate": f"{s.poll_hz:g} Hz at {s.baud_n} bit/s",
-        "tolerance": f"±{s.in_position_deg:g}°",
+        "tolerance": f"±{s.tolerance_deg:g}°",
     }
 
 

@@ -8,8 +8,9 @@ from typing import Annotated, Any
 import typer
 
 from graderd.cli.console import CliError, Json, example, print_json, print_table
+from graderd.core.axes import ACTUATORS
 from graderd.core.faults.catalogue import CATALOGUE, find_rows
-from graderd.core.faults.monitor import ACTUATORS, FaultRow
+from graderd.core.faults.monitor import FaultRow
 
 
 def register(app: typer.Typer) -> None:

@@ -6,13 +6,13 @@ import json as json_module
 import re
 import time
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
 from graderd.cli.client import Daemon, client_name, daemon_of
 from graderd.cli.console import CliError, ExitCode, Json, example, print_json, print_table, print_text
+from graderd.core.axes import AXES, JOG_AXES, JogName
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
@@ -22,31 +22,7 @@ RENEW_S = 0.1
 REPLY_S = 2.0
 SETTLED_S = 0.3
 HELD_S = 1.0
-TOLERANCE = {"deg": 0.6, "mm": 2.5}
 VALUE = re.compile(r"(?P<absolute>=)?(?P<sign>[+-])?(?P<number>\d{1,6}(\.\d{0,9})?|\.\d{1,9})\s*(?P<unit>[^\d\s.]*)")
-
-
-class Axis(StrEnum):
-    """What can be jogged."""
-
-    ROTATE = "rotate"
-    LIFT = "lift"
-    TILT = "tilt"
-    HEIGHT = "height"
-    SLOPE = "slope"
-    PITCH = "pitch"
-
-
-UNITS = {"rotate": "deg", "lift": "mm", "tilt": "mm", "height": "mm", "slope": "deg", "pitch": "deg"}
-MOVED_BY = {
-    "rotate": ("rotation",),
-    "lift": ("lift_left", "lift_right"),
-    "tilt": ("tilt",),
-    "height": ("lift_left", "lift_right"),
-    "slope": ("lift_left", "lift_right"),
-    "pitch": ("tilt",),
-}
-ALL_AXES = ("rotation", "lift_left", "lift_right", "tilt")
 
 
 @dataclass(frozen=True)
@@ -77,7 +53,7 @@ def _jog(app: typer.Typer) -> None:
     )
     def jog(
         context: typer.Context,
-        axis: Annotated[Axis, typer.Argument(help="What to move.")],
+        axis: Annotated[JogName, typer.Argument(help="What to move.")],
         value: Annotated[
             str,
             typer.Argument(
@@ -96,18 +72,18 @@ def _jog(app: typer.Typer) -> None:
 
         The blade holds when the command ends, however it ends.
         """
-        wish = parse_value(axis.value, value)
-        command = {"command": "jog", "axis": axis.value, "value": wish.value, "relative": wish.relative}
-        move(daemon_of(context), command, MOVED_BY[axis.value], hold_s, timeout_s, json)
+        wish = parse_value(axis, value)
+        command = {"command": "jog", "axis": axis, "value": wish.value, "relative": wish.relative}
+        move(daemon_of(context), command, JOG_AXES[axis].moves, hold_s, timeout_s, json)
 
 
-def parse_value(axis: str, text: str) -> JogValue:
+def parse_value(axis: JogName, text: str) -> JogValue:
     """``+5deg``, ``-5deg``, ``30deg``, ``=-30deg``.
 
     Raises:
         CliError: not such a value, or not in the axis's unit.
     """
-    unit = UNITS[axis]
+    unit = JOG_AXES[axis].unit
     match = VALUE.fullmatch(text.strip())
     if match is None:
         raise CliError(
@@ -224,12 +200,8 @@ class Arrival:
 
 
 def _there(axis: dict[str, Any]) -> bool:
-    """At its goal, or at the bound the gate put in its place, and at rest."""
-    if axis["measured"] is None or axis["limited"] is None or axis["moving"]:
-        return False
-    tolerance = TOLERANCE[axis["unit"]]
-    on_its_way = abs(axis["limited"] - axis["requested"]) > tolerance and not axis["limited_because"]
-    return not on_its_way and abs(axis["measured"] - axis["limited"]) <= tolerance
+    """Where it was asked to go, and at rest."""
+    return bool(axis["arrived"] and not axis["moving"])
 
 
 def _axis_text(axis: dict[str, Any]) -> str:
@@ -306,4 +278,4 @@ def _preset(app: typer.Typer) -> None:
             return
         if name not in names:
             raise CliError("preset", f"there is no preset {name!r}", f"there are: {', '.join(names) or 'none'}")
-        move(daemon, {"command": "preset", "name": name}, ALL_AXES, None, timeout_s, json)
+        move(daemon, {"command": "preset", "name": name}, AXES, None, timeout_s, json)

@@ -64,8 +64,99 @@ def _table(document: Document, path: list[str], *, create: bool) -> Document | N
     return found
 
 
-STEPS: Final[Mapping[int, Step]] = {}
-"""From each version to the next; none, as long as there has been one format only."""
+# Version 1 told limits, speeds and tolerances in up to three places; the machine did what the narrowest of them said.
+# Place in version 2 -> which of the values counts, and where they stood in version 1 with their defaults there.
+_Sources = tuple[tuple[str, float], ...]
+_MERGED: Final[Mapping[str, tuple[Callable[[list[float]], float], _Sources]]] = {
+    "rotation.min_deg": (max, (("gate.rotation_min_deg", -60.0), ("rotation.min_deg", -60.0))),
+    "rotation.max_deg": (min, (("gate.rotation_max_deg", 60.0), ("rotation.max_deg", 60.0))),
+    "rotation.window_deg": (min, (("gate.rotation_window_deg", 120.0),)),
+    "rotation.speed_deg_per_s": (
+        min,
+        (("gate.rotation_speed_deg_per_s", 25.0), ("rotation.velocity_deg_per_s", 30.0)),
+    ),
+    "rotation.acceleration_deg_per_s2": (
+        min,
+        (("gate.rotation_acceleration_deg_per_s2", 50.0), ("rotation.acceleration_deg_per_s2", 60.0)),
+    ),
+    "rotation.lead_deg": (min, (("gate.rotation_lead_deg", 10.0),)),
+    "rotation.tolerance_deg": (min, (("control.rotation_tolerance_deg", 0.5), ("rotation.in_position_deg", 0.5))),
+    "rotation.max_age_s": (min, (("control.rotation_max_age_s", 0.2),)),
+    **{
+        f"{axis}.{name}": (choose, sources)
+        for axis, part, low_mm, high_mm in (
+            ("lift_left", "lift", 5.0, 295.0),
+            ("lift_right", "lift", 5.0, 295.0),
+            ("tilt", "tilt", 3.0, 97.0),
+        )
+        for name, choose, sources in (
+            ("min_mm", max, ((f"gate.{part}_min_mm", low_mm), (f"{axis}.min_mm", low_mm))),
+            ("max_mm", min, ((f"gate.{part}_max_mm", high_mm), (f"{axis}.max_mm", high_mm))),
+            ("window_mm", min, ((f"gate.{part}_window_mm", 0.0),)),
+            ("speed_mm_per_s", min, ((f"gate.{part}_speed_mm_per_s", 0.0),)),
+            ("acceleration_mm_per_s2", min, ((f"gate.{part}_acceleration_mm_per_s2", 0.0),)),
+            ("lead_mm", min, ((f"gate.{part}_lead_mm", 0.0),)),
+            ("tolerance_mm", min, (("control.actuator_tolerance_mm", 0.0),)),
+            ("max_age_s", min, (("control.actuator_max_age_s", 0.0),)),
+        )
+    },
+}
+_GONE_IN_2: Final = frozenset(old for _, sources in _MERGED.values() for old, _ in sources) - set(_MERGED)
+
+
+def _to_2(document: Document) -> list[str]:
+    """One source for each limit, speed and tolerance: the section of the device."""
+    changes = []
+    for new, (choose, sources) in _MERGED.items():
+        given = {old: value for old, _ in sources if (value := _get(document, old)) is not None}
+        values = [given.get(old, default) for old, default in sources]
+        if not given or not all(isinstance(value, int | float) for value in values):
+            continue  # nothing to move; or no number, which the check of the result tells
+        value = choose(values)
+        if _get(document, new) != value:
+            _set(document, new, value)
+        if set(given) != {new} or given[new] != value:
+            changes.append(f"{' and '.join(given)}: now {new} = {value:g}")
+    for old in sorted(_GONE_IN_2):
+        _drop(document, old)
+    return changes
+
+
+def _get(document: Document, place: str) -> Any:
+    *path, key = place.split(".")
+    table = _table(document, path, create=False)
+    return None if table is None else table.get(key)
+
+
+def _set(document: Document, place: str, value: Any) -> None:
+    *path, key = place.split(".")
+    table = _table(document, path, create=True)
+    if table is not None:
+        table[key] = value
+
+
+def _drop(document: Document, place: str) -> None:
+    """Take a key away, and its table where that was the last one."""
+    *path, key = place.split(".")
+    table = _table(document, path, create=False)
+    if table is None or key not in table:
+        return
+    del table[key]
+    if path and not table:
+        parent = _table(document, path[:-1], create=False)
+        assert parent is not None  # its table was found
+        del parent[path[-1]]
+
+
+STEPS: Final[Mapping[int, Step]] = {1: _to_2}
+"""From each version to the next."""
+
+
+def _version_of(document: Document) -> Any:
+    """What the document says; one that says nothing is of the present version unless it has keys that are gone."""
+    if "version" in document:
+        return document["version"]
+    return 1 if any(_get(document, old) is not None for old in _GONE_IN_2) else CURRENT_VERSION
 
 
 def migrate_text(text: str, steps: Mapping[int, Step] = STEPS, current: int = CURRENT_VERSION) -> tuple[str, list[str]]:
@@ -80,7 +171,7 @@ def migrate_text(text: str, steps: Mapping[int, Step] = STEPS, current: int = CU
         raise ConfigError(None, [f"not valid TOML: {error}. Correct that line"]) from None
     except RecursionError:
         raise ConfigError(None, ["nested far too deeply to be a configuration. Restore the file"]) from None
-    version = document.get("version", current)
+    version = document.get("version", current) if steps is not STEPS else _version_of(document)
     if not isinstance(version, int) or version > current or any(v not in steps for v in range(int(version), current)):
         raise ConfigError(
             None,

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.core.attitude import AttitudeGeometry, Preset
+from graderd.core.axes import AxisFigures
 from graderd.core.blade import BladeGeometry
 from graderd.core.gate import GateSettings
 from graderd.core.lift_pair import LiftPairSettings
@@ -27,13 +28,9 @@ from graderd.perception.settings import CameraCalibration, PerceptionSettings
 
 
 class ControlSettings(Settings):
-    """The control tick and what it takes for fresh."""
+    """The control tick, and how the daemon ends."""
 
     tick_hz: float = Field(50.0, ge=10, le=200)
-    rotation_max_age_s: Positive = Field(0.2, description="an older angle counts as unknown: the rotation holds")
-    actuator_max_age_s: Positive = Field(0.4, description="feedback comes every 105 ms")
-    rotation_tolerance_deg: Positive = Field(0.5, description="arrived")
-    actuator_tolerance_mm: Positive = Field(1.5, description="arrived; the actuators rest 1-2 mm short")
     overrun_s: Positive = Field(0.1, description="a tick later than this is a fault")
     memory_warn_mb: Positive = 600.0
     shutdown_order: tuple[Literal["rotation", "actuators"], ...] = ("actuators", "rotation")
@@ -94,6 +91,10 @@ class TiltSection(ActuatorSettings):
     profile: str = "electrak_md_a050"
     min_mm: NotNegative = 3.0
     max_mm: Positive = 97.0
+    window_mm: Positive = 94.0
+    speed_mm_per_s: Positive = 25.0
+    acceleration_mm_per_s2: Positive = 100.0
+    lead_mm: Positive = 15.0
     current_limit_a: Positive = Field(3.5, le=25.0)
 
 
@@ -110,7 +111,7 @@ def _presets() -> dict[str, Preset]:
 class Config(Settings):
     """Everything. Sections that are absent take their defaults."""
 
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     simulated: bool = False
     camera: CameraSection = Field(default_factory=CameraSection)
     perception: PerceptionSettings = Field(default_factory=PerceptionSettings)
@@ -142,16 +143,14 @@ class Config(Settings):
         ]
         if len(set(addresses)) != len(addresses):
             raise ValueError(f"lift_left, lift_right, tilt and can need four different addresses, not {addresses}")
-        if self.gate.rotation_min_deg < self.rotation.min_deg or self.gate.rotation_max_deg > self.rotation.max_deg:
-            raise ValueError("gate.rotation_min_deg/max_deg must lie inside rotation.min_deg/max_deg")
         for zone, angle_deg in (
             ("left_deg", self.rule.left_deg),
             ("right_deg", self.rule.right_deg),
             ("center_deg", self.rule.center_deg),
             ("even_deg", self.rule.even_deg),
         ):
-            if not self.gate.rotation_min_deg <= angle_deg <= self.gate.rotation_max_deg:
-                raise ValueError(f"rule.{zone} ({angle_deg:g}) lies outside gate.rotation_min_deg..rotation_max_deg")
+            if not self.rotation.min_deg <= angle_deg <= self.rotation.max_deg:
+                raise ValueError(f"rule.{zone} ({angle_deg:g}) lies outside rotation.min_deg..max_deg")
         needed_n, age_s, rate_hz = self.rule.votes_needed_n, self.rule.vote_max_age_s, self.camera.rate_hz
         if rate_hz * age_s < needed_n - 1:
             raise ValueError(
@@ -160,3 +159,37 @@ class Config(Settings):
                 f"the one or the other until their product is {needed_n - 1} or more"
             )
         return self
+
+    def figures(self) -> dict[str, AxisFigures]:
+        """The figures of every axis: the sections of the devices are their only source."""
+        rotation = self.rotation
+        return {
+            "rotation": AxisFigures(
+                low=rotation.min_deg,
+                high=rotation.max_deg,
+                window=rotation.window_deg,
+                speed=rotation.speed_deg_per_s,
+                acceleration=rotation.acceleration_deg_per_s2,
+                lead=rotation.lead_deg,
+                tolerance=rotation.tolerance_deg,
+                max_age_s=rotation.max_age_s,
+            ),
+            **{name: _actuator_figures(section) for name, section in self.actuators().items()},
+        }
+
+    def actuators(self) -> dict[str, ActuatorSettings]:
+        """The sections of the actuators by axis."""
+        return {"lift_left": self.lift_left, "lift_right": self.lift_right, "tilt": self.tilt}
+
+
+def _actuator_figures(section: ActuatorSettings) -> AxisFigures:
+    return AxisFigures(
+        low=section.min_mm,
+        high=section.max_mm,
+        window=section.window_mm,
+        speed=section.speed_mm_per_s,
+        acceleration=section.acceleration_mm_per_s2,
+        lead=section.lead_mm,
+        tolerance=section.tolerance_mm,
+        max_age_s=section.max_age_s,
+    )

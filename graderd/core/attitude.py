@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from pydantic import Field
 
+from graderd.core.axes import Pose
 from graderd.hal.settings import Finite, NotNegative, Positive, Settings
 
 
@@ -72,3 +73,21 @@ def pitch_deg(geometry: AttitudeGeometry, tilt_mm: float) -> float:
 def tilt_extension(geometry: AttitudeGeometry, pitch: float) -> float:
     """Tilt extension (mm) for a pitch (deg); the inverse of :func:`pitch_deg`."""
     return geometry.tilt_level_mm + pitch / geometry.tilt_deg_per_mm
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredAttitude:
+    """The blade's attitude as far as it is known: height (mm) of the edge's centre, cross slope and pitch (deg)."""
+
+    height_mm: float | None = None
+    slope_deg: float | None = None
+    pitch_deg: float | None = None
+
+
+def measured_attitude(geometry: AttitudeGeometry, pose: Pose) -> MeasuredAttitude:
+    """From measured extensions; None where one is not known."""
+    pitch = None if pose.tilt_mm is None else pitch_deg(geometry, pose.tilt_mm)
+    if pose.lift_left_mm is None or pose.lift_right_mm is None:
+        return MeasuredAttitude(pitch_deg=pitch)
+    attitude = lift_attitude(geometry, pose.lift_left_mm, pose.lift_right_mm)
+    return MeasuredAttitude(attitude.height_mm, attitude.slope_deg, pitch)

@@ -6,14 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-AXIS_UNITS = {
-    "rotate": "deg",
-    "lift": "mm",
-    "tilt": "mm",
-    "height": "mm",
-    "slope": "deg",
-    "pitch": "deg",
-}
+from graderd.core.axes import JogName
 
 
 class _Command(BaseModel):
@@ -67,7 +60,7 @@ class Jog(_Command):
     """
 
     command: Literal["jog"] = "jog"
-    axis: Literal["rotate", "lift", "tilt", "height", "slope", "pitch"]
+    axis: JogName
     value: Annotated[float, Field(allow_inf_nan=False, description="in the axis's unit: deg or mm")]
     relative: bool = False
 

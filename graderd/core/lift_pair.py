@@ -10,14 +10,14 @@ Pure: no clock, no device; :meth:`LiftPair.step` is called every control tick wi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from pydantic import Field
 
+from graderd.core.axes import LIFTS, Goals
+from graderd.hal.fault import DeviceFault
 from graderd.hal.settings import Positive, Settings
-
-SIDES: Final = ("lift_left", "lift_right")
 
 
 class LiftPairSettings(Settings):
@@ -212,7 +212,7 @@ class LiftPair:
         """Commands for this tick. ``left`` and ``right`` are the newest readings, None where there is none."""
         if self._stopped:
             return self._stop(self._stopped)
-        for name, reading in zip(SIDES, (left, right), strict=True):
+        for name, reading in zip(LIFTS, (left, right), strict=True):
             if reading is None or now_s - reading.time_s > self._settings.reading_max_age_s:
                 return self._stop(f"{name} is not measured")
         assert left is not None  # for the type checker; the loop above returned otherwise
@@ -281,7 +281,7 @@ class LiftPair:
         )
 
     def _stuck(self, now_s: float) -> str:
-        for name, side in zip(SIDES, self._sides, strict=True):
+        for name, side in zip(LIFTS, self._sides, strict=True):
             remaining_mm = abs(side.target_mm - side.position_mm)
             moved = abs(side.position_mm - side.moved_from_mm) > _MOVED_MM
             if moved or side.share == 0.0 or remaining_mm < 3.0:
@@ -356,3 +356,49 @@ class LiftPair:
     def _commands(self) -> tuple[SideCommand, SideCommand]:
         left, right = self._sides
         return SideCommand(left.target_mm, left.share), SideCommand(right.target_mm, right.share)
+
+
+class LiftCoordinator:
+    """Turns the two lifts' goals into what each side shall do this tick, so that they keep together."""
+
+    def __init__(self, settings: LiftPairSettings) -> None:
+        self._pair = LiftPair(settings)
+        self._targets: tuple[float, float] | None = None
+        self._last: PairCommand | None = None
+        self._since_s: float | None = None
+
+    @property
+    def stopped(self) -> str:
+        """Why both sides hold although a goal is set; empty where they do not. A new goal starts anew."""
+        return self._last.stopped if self._last is not None else ""
+
+    def step(
+        self, goals: Goals, now_s: float, left: SideReading | None, right: SideReading | None
+    ) -> tuple[Goals, dict[str, float]]:
+        """Goals for this tick and the speed share of each lift (1 where not named)."""
+        if goals.lift_left_mm is None or goals.lift_right_mm is None:
+            if self._targets is not None:
+                self._pair.release()
+            self._targets = self._last = None
+            return replace(goals, lift_left_mm=None, lift_right_mm=None), {}
+        targets = (goals.lift_left_mm, goals.lift_right_mm)
+        if self._targets is not None and self.stopped and _differ(targets, self._targets):
+            self._pair.release()
+        self._targets = targets
+        command = self._last = self._pair.step(now_s, left, right, *targets)
+        self._since_s = (self._since_s or now_s) if command.condition or command.stopped else None
+        return (
+            replace(goals, lift_left_mm=command.left.target_mm, lift_right_mm=command.right.target_mm),
+            {"lift_left": command.left.speed_share, "lift_right": command.right.speed_share},
+        )
+
+    def faults(self) -> tuple[DeviceFault, ...]:
+        """``sides_apart`` while the sides are further apart than allowed, or one stopped the other."""
+        if self._last is None or self._since_s is None:
+            return ()
+        detail = self._last.stopped or f"{self._last.apart_mm:.1f} mm apart on their way"
+        return (DeviceFault("lift_left", "sides_apart", detail, self._since_s),)
+
+
+def _differ(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    return any(abs(a - b) > _NEW_TARGET_MM for a, b in zip(one, other, strict=True))

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from graderd.core import commands as cmd
-from graderd.core.faults.monitor import ALL_AXES, ActiveFault, Reaction, held_axes, worst
+from graderd.core.axes import PARTS, Goals, Pose
+from graderd.core.faults.monitor import ActiveFault, Reaction, held_axes, worst
 from graderd.core.rule import Decision, RuleSettings, decide
 from graderd.core.soil import SoilObservation
 from graderd.hal.settings import Positive, Settings
@@ -34,31 +35,6 @@ class MachineSettings(Settings):
 
     arm_timeout_s: Positive = 5.0
     lease_s: Positive = 0.3
-
-
-@dataclass(frozen=True, slots=True)
-class Goals:
-    """Where each axis shall go; None: stay where it is."""
-
-    rotation_deg: float | None = None
-    lift_left_mm: float | None = None
-    lift_right_mm: float | None = None
-    tilt_mm: float | None = None
-
-    @property
-    def empty(self) -> bool:
-        """Whether every axis stays."""
-        return self == Goals()
-
-
-@dataclass(frozen=True, slots=True)
-class Pose:
-    """Measured positions that are fresh enough to act on; None where stale."""
-
-    rotation_deg: float | None = None
-    lift_left_mm: float | None = None
-    lift_right_mm: float | None = None
-    tilt_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,14 +296,7 @@ def _why_holding(state: State, inputs: Inputs) -> tuple[str, ...]:
 
 def _unheld(goals: Goals, held: frozenset[str]) -> Goals:
     """Goals without those of the axes that must stay."""
-    if held == ALL_AXES:
-        return Goals()
-    return Goals(
-        rotation_deg=None if "rotation" in held else goals.rotation_deg,
-        lift_left_mm=None if "lift" in held else goals.lift_left_mm,
-        lift_right_mm=None if "lift" in held else goals.lift_right_mm,
-        tilt_mm=None if "tilt" in held else goals.tilt_mm,
-    )
+    return Goals.of(**{axis: None if PARTS[axis] in held else goal for axis, goal in goals.items()})
 
 
 def _stopped(reason: str) -> State:

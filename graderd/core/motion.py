@@ -13,12 +13,9 @@ from graderd.core.attitude import (
     pitch_deg,
     tilt_extension,
 )
-from graderd.core.commands import AXIS_UNITS, Jog
+from graderd.core.axes import UNITS, AxisFigures, Goals, Pose
+from graderd.core.commands import Jog
 from graderd.core.commands import Preset as PresetCommand
-from graderd.core.machine import Goals, Pose
-
-Limits = Mapping[str, tuple[float, float]]
-"""Low and high of each axis: deg for ``rotation``, mm of extension for the others."""
 
 
 def resolve(
@@ -26,7 +23,7 @@ def resolve(
     pose: Pose,
     geometry: AttitudeGeometry,
     presets: Mapping[str, Preset],
-    limits: Limits,
+    figures: Mapping[str, AxisFigures],
 ) -> tuple[Goals, ...] | str:
     """Goals in stages, or why they cannot be: no measurement to start from, unknown preset, beyond a limit."""
     if isinstance(command, Jog):
@@ -43,7 +40,7 @@ def resolve(
             return made
         stages = made
     for goals in stages:
-        problem = _beyond(goals, limits)
+        problem = _beyond(goals, figures)
         if problem:
             return problem
     return stages
@@ -102,16 +99,9 @@ def _no_start(jog: Jog) -> str:
     return f"the position of '{jog.axis}' is not known now, so it cannot be moved from there"
 
 
-def _beyond(goals: Goals, limits: Limits) -> str:
-    wanted = {
-        "rotation": goals.rotation_deg,
-        "lift_left": goals.lift_left_mm,
-        "lift_right": goals.lift_right_mm,
-        "tilt": goals.tilt_mm,
-    }
-    for axis, value in wanted.items():
-        low, high = limits[axis]
-        unit = AXIS_UNITS["rotate"] if axis == "rotation" else "mm"
+def _beyond(goals: Goals, figures: Mapping[str, AxisFigures]) -> str:
+    for axis, value in goals.items():
+        low, high, unit = figures[axis].low, figures[axis].high, UNITS[axis]
         if value is not None and not low <= value <= high:
             return f"{axis} would go to {value:.1f} {unit}, beyond its limits of {low:g} to {high:g} {unit}"
     return ""

@@ -13,19 +13,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 from pydantic import Field
 
-from graderd.core.faults.monitor import ACTUATORS
+from graderd.core.axes import ACTUATORS, UNITS, AxisFigures
 from graderd.hal.fault import DeviceFault, PresentFaults
+from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.linear_actuator import ActuatorTelemetry
+from graderd.hal.rotator import RotatorTelemetry
 from graderd.hal.settings import NotNegative, Positive, RotatorSettings, Settings
 
 
-class AxisFigures(Settings):
-    """What is plausible for one axis. Lengths are in the axis's ``unit``; speeds are per second."""
+class MotionFigures(Settings):
+    """What is plausible for one axis, in its unit (``graderd.core.axes.UNITS``) and seconds."""
 
-    unit: Literal["deg", "mm"]
     speed: Positive = Field(description="fastest that the gate lets its goal move: overspeed and arrival go by it")
     fastest: Positive = Field(description="fastest that its device drives it: braking from it takes longest")
     acceleration: Positive = Field(description="how hard its device brakes at least, per second squared")
@@ -66,27 +67,26 @@ _SETTLE_S = 0.5
 _SAME_GOAL = 0.05
 
 
-def axis_figures(rotation: RotatorSettings, speeds: Mapping[str, float]) -> dict[str, AxisFigures]:
-    """The figures of every axis in ``speeds`` (the gate's); those of the actuators fit an Electrak HD or MD.
+def motion_figures(rotation: RotatorSettings, figures: Mapping[str, AxisFigures]) -> dict[str, MotionFigures]:
+    """For every axis in ``figures``; those of the actuators fit an Electrak HD or MD.
 
     Where each comes from: the rotation's from its settings and from the PH54's play of 0.1 degree; the actuators' from
     control messages every 100 ms, feedback every 105 ms with a noise of 0.1 mm, a start zone of 2 mm, and a brake that
     stops them within 20 ms.
     """
-    found: dict[str, AxisFigures] = {}
-    for axis, speed in speeds.items():
+    found: dict[str, MotionFigures] = {}
+    for axis, its in figures.items():
         if axis == "rotation":
-            found[axis] = AxisFigures(
-                unit="deg",
-                speed=speed,
-                fastest=rotation.velocity_deg_per_s,
-                acceleration=rotation.acceleration_deg_per_s2,
-                near=rotation.in_position_deg,
-                tolerance=rotation.in_position_deg,
+            found[axis] = MotionFigures(
+                speed=its.speed,
+                fastest=rotation.profile_velocity_deg_per_s,
+                acceleration=rotation.profile_acceleration_deg_per_s2,
+                near=its.tolerance,
+                tolerance=its.tolerance,
                 still=0.8,
                 reaction_s=0.0,
                 rest_s=0.3,
-                moved=min(0.2, 0.3 * rotation.velocity_deg_per_s * rotation.not_moving_s),
+                moved=min(0.2, 0.3 * rotation.profile_velocity_deg_per_s * rotation.not_moving_s),
                 not_moving_s=rotation.not_moving_s,
                 not_arriving_s=4.0 * rotation.not_moving_s,
                 wrong_way=1.0,
@@ -94,10 +94,9 @@ def axis_figures(rotation: RotatorSettings, speeds: Mapping[str, float]) -> dict
                 overspeed_margin=3.0,
             )
         else:
-            found[axis] = AxisFigures(
-                unit="mm",
-                speed=speed,
-                fastest=max(speed, 75.0),
+            found[axis] = MotionFigures(
+                speed=its.speed,
+                fastest=max(its.speed, 75.0),
                 acceleration=500.0,
                 near=3.0,
                 tolerance=2.0,
@@ -132,10 +131,26 @@ class AxisSample:
     current_a: float | None = None
 
 
+def axis_sample(name: str, lifecycle: Lifecycle, told: RotatorTelemetry | ActuatorTelemetry) -> AxisSample | None:
+    """The sample that a device's telemetry gives; None without a valid position."""
+    position, velocity, current = told.position, told.velocity, told.current_a
+    if position is None or not position.valid:
+        return None
+    return AxisSample(
+        name=name,
+        position=position.value,
+        time_s=position.time_s,
+        velocity=None if velocity is None else velocity.value,
+        goal=told.goal,
+        powered=lifecycle is Lifecycle.ACTIVE,
+        current_a=None if current is None else current.value,
+    )
+
+
 class PlausibilityMonitor:
     """Watches all axes. :meth:`judge` is called every tick."""
 
-    def __init__(self, figures: Mapping[str, AxisFigures]) -> None:
+    def __init__(self, figures: Mapping[str, MotionFigures]) -> None:
         self._watches = {axis: _AxisWatch(axis, its) for axis, its in figures.items()}
 
     def judge(self, samples: Iterable[AxisSample], now_s: float) -> tuple[DeviceFault, ...]:
@@ -153,13 +168,13 @@ class PlausibilityMonitor:
 class _AxisWatch:
     """One axis. It is either *driven* (it has a goal) or *held*, and each change of that begins anew."""
 
-    def __init__(self, name: str, figures: AxisFigures) -> None:
+    def __init__(self, name: str, figures: MotionFigures) -> None:
         self._figures = figures
         self._faults = PresentFaults(name)
         actuator = name in ACTUATORS
         self._uncommanded = "uncommanded_motion" if actuator else "moving_uncommanded"
         self._wrong_way = "uncommanded_motion" if actuator else "wrong_way"
-        self._unit = "°" if figures.unit == "deg" else " mm"
+        self._unit = "°" if UNITS[name] == "deg" else " mm"
         self._last: AxisSample | None = None
         self._velocity = self._gained = 0.0
         # held or settled at its goal: where it rests, once it does

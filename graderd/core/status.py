@@ -14,7 +14,9 @@ class _Status(BaseModel):
 
 
 class AxisStatus(_Status):
-    """One axis, in degrees (rotation) or millimetres: requested, limited, sent and measured are all visible."""
+    """One axis, in degrees (rotation) or millimetres: requested, limited, sent and measured are all visible.
+
+    ``arrived``: it stands where it was asked to go, within its tolerance."""
 
     name: str
     unit: str
@@ -22,6 +24,7 @@ class AxisStatus(_Status):
     requested: float | None = None
     limited: float | None = None
     limited_because: str = ""
+    arrived: bool = False
     sent: float | None = None
     measured: float | None = None
     measured_age_s: float | None = None

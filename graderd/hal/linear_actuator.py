@@ -32,6 +32,21 @@ class ActuatorTelemetry:
     thermal_load: float = 0.0
     counters: dict[str, int] = field(default_factory=dict)
 
+    @property
+    def position(self) -> Reading[float] | None:
+        """The extension, by the name that every axis has for it."""
+        return self.position_mm
+
+    @property
+    def velocity(self) -> Reading[float] | None:
+        """Its speed, likewise."""
+        return self.velocity_mm_per_s
+
+    @property
+    def goal(self) -> float | None:
+        """Its goal, likewise."""
+        return self.goal_mm
+
 
 class LinearActuator(Protocol):
     """One linear axis. All methods belong to one event loop; the sync ones never wait."""

@@ -35,6 +35,21 @@ class RotatorTelemetry:
     torque_on: Reading[bool] | None = None
     counters: dict[str, int] = field(default_factory=dict)
 
+    @property
+    def position(self) -> Reading[float] | None:
+        """The angle, by the name that every axis has for it."""
+        return self.angle_deg
+
+    @property
+    def velocity(self) -> Reading[float] | None:
+        """Its speed, likewise."""
+        return self.velocity_deg_per_s
+
+    @property
+    def goal(self) -> float | None:
+        """Its goal, likewise."""
+        return self.goal_deg
+
 
 class Rotator(Protocol):
     """A blade rotation axis. All methods belong to one event loop; the sync ones never wait."""

@@ -14,6 +14,10 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
+PROFILE_MARGIN = 1.2
+"""The servo's profile over the goal's speed and acceleration."""
+
+
 class Settings(BaseModel):
     """Base of all settings: frozen, strict about unknown keys, defaults checked too."""
 
@@ -35,16 +39,19 @@ class RotatorSettings(Settings):
     zero_deg: Finite = Field(0.0, description="blade angle read at the servo's zero, subtracted")
     sign: Literal[1, -1] = Field(1, description="-1 where the servo turns the blade the other way round")
     gear_ratio: Positive = Field(1.0, description="servo turns for one blade turn")
-    min_deg: Finite = Field(-60.0, description="soft limit at the blade")
-    max_deg: Finite = Field(60.0, description="soft limit at the blade")
-    velocity_deg_per_s: Positive = Field(30.0, description="profile velocity at the blade")
-    acceleration_deg_per_s2: Positive = Field(60.0, description="profile acceleration at the blade")
+    min_deg: Finite = Field(-60.0, description="limit at the blade, for gate and servo alike")
+    max_deg: Finite = Field(60.0, description="limit at the blade, for gate and servo alike")
+    window_deg: Positive = Field(120.0, description="largest distance from where the blade stood when it was armed")
+    speed_deg_per_s: Positive = Field(25.0, description="largest speed of the goal; the servo's profile leaves room")
+    acceleration_deg_per_s2: Positive = Field(50.0, description="largest change of that speed")
+    lead_deg: Positive = Field(10.0, description="how far the goal may run ahead of a blade that is held back")
+    tolerance_deg: Positive = Field(0.5, description="so near the goal counts as arrived")
+    max_age_s: Positive = Field(0.2, description="an older angle counts as unknown: the rotation holds")
     current_limit_a: Positive = Field(9.3, le=22.74, description="9.3 A is the continuous rating")
     watchdog_s: Positive = Field(0.2, le=2.54, description="the servo's own bus watchdog, steps of 20 ms")
     poll_hz: Positive = Field(50.0, le=200, description="telemetry reads a second")
     goal_timeout_s: Positive = Field(0.2, description="a goal not renewed for so long becomes a hold")
     reply_timeout_s: Positive = Field(0.25, description="no valid reply for so long: the servo is lost")
-    in_position_deg: Positive = Field(0.5, description="tolerance for arrival, and for moving uncommanded")
     not_moving_s: Positive = Field(0.7, description="goal ahead and no movement for so long: commanded but not moving")
     voltage_warn_low_v: Positive = 20.0
     voltage_warn_high_v: Positive = 30.0
@@ -57,6 +64,16 @@ class RotatorSettings(Settings):
         if self.min_deg >= self.max_deg:
             raise ValueError(f"min_deg ({self.min_deg}) must be below max_deg ({self.max_deg})")
         return self
+
+    @property
+    def profile_velocity_deg_per_s(self) -> float:
+        """The servo's own profile: faster than the goal moves, so that following it is no second regulator."""
+        return PROFILE_MARGIN * self.speed_deg_per_s
+
+    @property
+    def profile_acceleration_deg_per_s2(self) -> float:
+        """See :attr:`profile_velocity_deg_per_s`; this is also how hard an ordinary stop brakes."""
+        return PROFILE_MARGIN * self.acceleration_deg_per_s2
 
 
 class CanSettings(Settings):
@@ -87,8 +104,14 @@ class ActuatorSettings(Settings):
 
     address_n: int = Field(19, ge=0, le=253, description="J1939 source address of the actuator")
     profile: str = Field("electrak_hd_b017", description="name of the layout in firmware_profiles")
-    min_mm: NotNegative = Field(5.0, description="soft limit of extension")
-    max_mm: Positive = Field(295.0, description="soft limit of extension")
+    min_mm: NotNegative = Field(5.0, description="limit of extension, for gate and driver alike")
+    max_mm: Positive = Field(295.0, description="limit of extension, for gate and driver alike")
+    window_mm: Positive = Field(290.0, description="largest distance from where the axis stood when it was armed")
+    speed_mm_per_s: Positive = Field(60.0, description="largest speed of the goal")
+    acceleration_mm_per_s2: Positive = Field(200.0, description="largest change of that speed")
+    lead_mm: Positive = Field(30.0, description="how far the goal may run ahead of an axis that is held back")
+    tolerance_mm: Positive = Field(1.5, description="so near the goal counts as arrived; Electraks rest 1-2 mm short")
+    max_age_s: Positive = Field(0.4, description="an older position counts as unknown; feedback comes every 105 ms")
     current_limit_a: Positive = Field(18.0, le=25.0)
     speed_percent: int = Field(80, ge=20, le=100, multiple_of=5, description="motor duty in full-speed moves")
     feedback_timeout_s: Positive = Field(0.35, description="three missing feedback messages: the actuator is lost")

@@ -1,4 +1,4 @@
-"""The control tick: takes the newest of everything, decides, limits, commands, feeds the watchdog. Never waits."""
+"""The control loop around the tick: senses, calls :class:`graderd.core.tick.Controller`, acts. It never waits."""
 
 from __future__ import annotations
 
@@ -10,29 +10,17 @@ from typing import Protocol
 
 from graderd.config import Config
 from graderd.core import commands as cmd
-from graderd.core.faults.catalogue import CATALOGUE
-from graderd.core.faults.monitor import Clear, FaultState, clear_faults, update_faults
-from graderd.core.gate import AxisPass, GateInputs, GateState, pass_gate
-from graderd.core.lift import LiftCoordinator, height_mm
-from graderd.core.lift_pair import SideReading
-from graderd.core.machine import ARMED, Inputs, Intents, Mode, Pose, State, step
-from graderd.core.motion import resolve
-from graderd.core.plausibility import PlausibilityMonitor, axis_figures
+from graderd.core.plausibility import motion_figures
 from graderd.core.soil import SoilObservation
+from graderd.core.tick import AxisSensed, AxisTick, Controller, Sensed, Tick, TickSettings
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceError
-from graderd.hal.fault import DeviceFault, PresentFaults
-from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.reading import Reading
-from graderd.runtime.devices import ACTUATOR_NAMES, Devices, PowerSequencer
-from graderd.runtime.readiness import requirements
+from graderd.hal.fault import DeviceFault
+from graderd.runtime.devices import Devices, PowerSequencer
 from graderd.runtime.state_file import StateFile
 
 MAX_COMMANDS_PER_TICK = 32
 LATENESS_WINDOW_N = 500
-BLOCKED_S = 0.5
-"""A tick this late: goals have timed out and the servo's watchdog (0.2 s by default) has tripped meanwhile."""
-LAPSE_SHOWN_S = 3.0
 
 log = logging.getLogger(__name__)
 
@@ -53,8 +41,28 @@ class Eyes(Protocol):
         ...
 
 
+def tick_settings(config: Config) -> TickSettings:
+    """What the tick goes by, out of the configuration."""
+    figures = config.figures()
+    return TickSettings(
+        figures=figures,
+        motion=motion_figures(config.rotation, figures),
+        machine=config.machine,
+        rule=config.rule,
+        gate=config.gate,
+        lift_pair=config.lift_pair,
+        attitude=config.attitude,
+        presets=config.presets,
+        overrun_s=config.control.overrun_s,
+        max_frame_age_s=config.perception.decision.max_frame_age_s,
+    )
+
+
 class ControlLoop:
-    """Owns the machine's state. One per daemon."""
+    """One per daemon. ``sensed`` and ``tick`` are the newest: whoever wants to know something reads them.
+
+    ``fault_sources``: told the time, each says what it sees wrong now. ``on_tick``: called at the end of every tick.
+    """
 
     def __init__(
         self,
@@ -64,30 +72,21 @@ class ControlLoop:
         clock: Clock,
         state_file: StateFile,
     ) -> None:
-        self.config = config
-        self.devices = devices
-        self.state = State()
-        self.faults = FaultState()
-        self.passed: dict[str, AxisPass] = {}
-        self.intents = Intents()
-        self.overruns_n = 0
         self.lateness_s: deque[float] = deque(maxlen=LATENESS_WINDOW_N)
-        self.time_s = clock.now_s()
         self.last_stop = state_file.load()
-        self.connection_problems: dict[str, str] = {}
-        self.extra_faults: list[Callable[[float], tuple[DeviceFault, ...]]] = []
+        self.fault_sources: list[Callable[[float], tuple[DeviceFault, ...]]] = []
         self.on_tick: Callable[[], None] | None = None
+        self._period_s = 1.0 / config.control.tick_hz
+        self._controller = Controller(tick_settings(config))
+        self._devices = devices
         self._eyes = eyes
         self._clock = clock
         self._state_file = state_file
-        self._gate = GateState()
-        self._lift = LiftCoordinator(config.lift_pair)
-        speeds = {axis: limit.speed for axis, limit in config.gate.limits().items()}
-        self._plausibility = PlausibilityMonitor(axis_figures(config.rotation, speeds))
         self._power = PowerSequencer(devices)
         self._queue: deque[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = deque()
-        self._moving: set[str] = set()
-        self._own_faults = PresentFaults("daemon")
+        self._refused: dict[str, str] = {}
+        self.sensed = self._sense(())
+        self.tick = self._controller.step(self.sensed)
 
     # ---- commands -------------------------------------------------------------------------------------------------
 
@@ -108,210 +107,90 @@ class ControlLoop:
 
     async def run(self) -> None:
         """Tick at the configured rate until cancelled. A late tick is counted, and not made up for."""
-        period_s = 1.0 / self.config.control.tick_hz
         due_s = self._clock.now_s()
         try:
             while True:
-                late_s = self._clock.now_s() - due_s
-                self.lateness_s.append(max(0.0, late_s))
-                if late_s > self.config.control.overrun_s:
-                    self.overruns_n += 1
-                    self._note_late(late_s, self._clock.now_s())
-                self.tick()
-                due_s = max(due_s + period_s, self._clock.now_s())
+                late_s = max(0.0, self._clock.now_s() - due_s)
+                self.lateness_s.append(late_s)
+                self.turn(late_s)
+                due_s = max(due_s + self._period_s, self._clock.now_s())
                 await asyncio.sleep(max(0.0, due_s - self._clock.now_s()))
         finally:
             await self._power.close()
 
-    def tick(self) -> None:
-        """One turn of sense, decide, limit, act."""
+    def turn(self, late_s: float = 0.0) -> None:
+        """One turn of sense, decide, act, with the commands that came meanwhile."""
         queued = [self._queue.popleft() for _ in range(min(len(self._queue), MAX_COMMANDS_PER_TICK))]
-        replies = self._step(tuple(command for command, _ in queued))
+        replies = self._step(tuple(command for command, _ in queued), late_s)
         for (_, future), reply in zip(queued, replies, strict=True):
             if not future.done():
                 future.set_result(reply)
         if self.on_tick is not None:
             self.on_tick()
 
-    def _step(self, commands: tuple[cmd.Command, ...]) -> tuple[cmd.Reply, ...]:
-        now_s = self._clock.now_s()
-        dt_s, self.time_s = now_s - self.time_s, now_s
-        pose = self.pose(now_s)
-        self.faults = update_faults(self.faults, self._present_faults(now_s), now_s, CATALOGUE)
-        self._clear_latches(commands)
-        before = self.state
-        # The machine answers stop first; replies are put back into the order the commands came in.
-        order = sorted(range(len(commands)), key=lambda i: not isinstance(commands[i], cmd.Stop))
-        result = step(
-            self.state,
-            Inputs(
-                now_s=now_s,
-                resolve=lambda command, at: resolve(
-                    command, at, self.config.attitude, self.config.presets, self._limits()
-                ),
-                commands=commands,
-                observation=self._eyes.take_observation(),
-                pose=pose,
-                settled=self._settled(pose),
-                devices_active=self._power.all_active,
-                arm_error=self._power.take_error(),
-                unmet=tuple(r.unmet() for r in requirements(self, now_s) if r.mandatory and not r.met),
-                faults=self.faults.active,
-            ),
-            self.config.machine,
-            self.config.rule,
-        )
-        self.state, self.intents = result.state, result.intents
-        self._note_transition(before, result.state)
-        self._note_lapse(before, result.state, now_s)
-        self._act(dt_s, pose)
-        replies: list[cmd.Reply] = [result.replies[0]] * len(commands) if commands else []
-        for position, index in enumerate(order):
-            replies[index] = result.replies[position]
-        return tuple(replies)
+    def _step(self, commands: tuple[cmd.Command, ...], late_s: float = 0.0) -> tuple[cmd.Reply, ...]:
+        before = self.tick.state
+        self.sensed = self._sense(commands, late_s)
+        self.tick = self._controller.step(self.sensed)
+        after = self.tick.state
+        if before.mode is not after.mode:
+            log.info("%s -> %s: %s", before.mode, after.mode, after.reason)
+        self._act(self.tick)
+        return self.tick.replies
 
-    def _act(self, dt_s: float, pose: Pose) -> None:
-        """Pass the gate and hand what may be sent to the drivers."""
-        self._power.want(self.intents.power)
-        goals, shares = self._lift.step(
-            self.intents.goals, self.time_s, self._side("lift_left"), self._side("lift_right")
+    def _sense(self, commands: tuple[cmd.Command, ...], late_s: float = 0.0) -> Sensed:
+        """Everything that is known now; each device is asked once."""
+        now_s = self._clock.now_s()
+        found: list[DeviceFault] = [*self._devices.link.faults(), *self._eyes.faults()]
+        axes: dict[str, AxisSensed] = {}
+        for name, device in self._devices.all().items():
+            found.extend(device.faults())
+            axes[name] = AxisSensed(device.lifecycle, device.telemetry(), self._devices.problem_of(name))
+        for source in self.fault_sources:
+            found.extend(source(now_s))
+        if self._state_file.problem:
+            found.append(DeviceFault("daemon", "state_file_corrupt", self._state_file.problem, now_s))
+        refused, self._refused = self._refused, {}
+        return Sensed(
+            now_s=now_s,
+            axes=axes,
+            faults=tuple(found),
+            commands=commands,
+            observation=self._eyes.take_observation(),
+            powered=self._power.all_active,
+            arm_error=self._power.take_error(),
+            refused=refused,
+            late_s=late_s,
         )
-        self._gate, self.passed = pass_gate(
-            self._gate,
-            goals,
-            GateInputs(
-                settings=self.config.gate,
-                mode=self.state.mode,
-                pose=pose,
-                dt_s=dt_s,
-                lease_ok=self.state.mode is Mode.AUTO or self.state.lease is not None,
-                height_mm=height_mm(self.config.attitude, pose),
-            ),
-        )
-        for axis, result in self.passed.items():
-            try:
-                self._send(axis, result.limited, shares.get(axis, 1.0))
-            except DeviceError as error:
-                # The driver is the last to say no (its own soft limits, a lost device); the axis holds.
-                self.passed[axis] = AxisPass(result.requested, None, str(error))
-                self._hold(axis)
-        angle = self.devices.rotation.telemetry().angle_deg
+
+    def _act(self, tick: Tick) -> None:
+        """Hand what was decided to the devices."""
+        if tick.stopped_now:
+            self._hold_all()
+            self.last_stop = self._state_file.save(tick.state.reason)
+        self._power.want(tick.intents.power)
+        for axis, decided in tick.axes.items():
+            self._tell(axis, decided)
+        angle = self.sensed.axes["rotation"].telemetry.position
         if angle is not None and angle.valid:
             self._eyes.send_angle(angle.value, angle.time_s)
 
-    def _send(self, axis: str, limited: float | None, speed_share: float) -> None:
-        if limited is None or not self._power.all_active:
-            self._hold(axis)
-        elif axis == "rotation":
-            self._moving.add(axis)
-            self.devices.rotation.set_goal_deg(limited)
-        else:
-            self._moving.add(axis)
-            self.devices.actuators[axis].set_target_mm(limited, speed_share)
+    def _tell(self, axis: str, decided: AxisTick) -> None:
+        if decided.send is None:
+            if decided.hold:
+                self._devices.all()[axis].hold()
+            return
+        try:
+            if axis == "rotation":
+                self._devices.rotation.set_goal_deg(decided.send)
+            else:
+                self._devices.actuators[axis].set_target_mm(decided.send, decided.speed_share)
+        except DeviceError as error:
+            # The driver is the last to say no (its own soft limits, a lost device); the axis holds.
+            self._refused[axis] = str(error)
+            self._devices.all()[axis].hold()
 
     def _hold_all(self) -> None:
         """The stop path: every axis is told, whatever one of the drivers does."""
-        for name in self.devices.hold_all():
+        for name in self._devices.hold_all():
             log.error("%s: its driver failed to take the hold; its own dead man ends the motion", name)
-        self._moving.clear()
-
-    def _side(self, name: str) -> SideReading | None:
-        reading = self.devices.actuators[name].telemetry().position_mm
-        return SideReading(reading.value, reading.time_s) if reading is not None and reading.valid else None
-
-    def _hold(self, axis: str) -> None:
-        """Once: a hold renewed every tick would follow every bit of measured drift."""
-        if axis in self._moving:
-            self._moving.discard(axis)
-            self.devices.all()[axis].hold()
-
-    # ---- what is known --------------------------------------------------------------------------------------------
-
-    def pose(self, now_s: float) -> Pose:
-        """Measured positions fresh enough to act on."""
-        control = self.config.control
-        positions = {
-            name: _fresh(self.devices.actuators[name].telemetry().position_mm, now_s, control.actuator_max_age_s)
-            for name in ACTUATOR_NAMES
-        }
-        return Pose(
-            rotation_deg=_fresh(self.devices.rotation.telemetry().angle_deg, now_s, control.rotation_max_age_s),
-            lift_left_mm=positions["lift_left"],
-            lift_right_mm=positions["lift_right"],
-            tilt_mm=positions["tilt"],
-        )
-
-    def _settled(self, pose: Pose) -> bool:
-        """Whether every axis with a goal stands at it, or at the bound the gate lets it have."""
-        control = self.config.control
-        for axis, result in self.passed.items():
-            rotation = axis == "rotation"
-            goals = self.intents.goals
-            wanted = goals.rotation_deg if rotation else getattr(goals, f"{axis}_mm")
-            if wanted is None:
-                continue
-            measured = pose.rotation_deg if rotation else getattr(pose, f"{axis}_mm")
-            tolerance = control.rotation_tolerance_deg if rotation else control.actuator_tolerance_mm
-            goal = result.limited if result.reason and result.limited is not None else wanted
-            if measured is None or abs(measured - goal) > tolerance:
-                return False
-        return True
-
-    def _limits(self) -> dict[str, tuple[float, float]]:
-        return {axis: (limit.low, limit.high) for axis, limit in self.config.gate.limits().items()}
-
-    def _present_faults(self, now_s: float) -> list[DeviceFault]:
-        found: list[DeviceFault] = [*self.devices.link.faults(), *self._eyes.faults(), *self._lift.faults()]
-        for device in self.devices.all().values():
-            found.extend(device.faults())
-        found.extend(self._plausibility.judge(self.devices.axis_samples(), now_s))
-        for source in self.extra_faults:
-            found.extend(source(now_s))
-        problem = self._state_file.problem
-        self._own_faults.keep("state_file_corrupt", bool(problem), problem, now_s)
-        return [*found, *self._own_faults.present(now_s)]
-
-    def _note_transition(self, before: State, after: State) -> None:
-        if before.mode is after.mode:
-            return
-        log.info("%s -> %s: %s", before.mode, after.mode, after.reason)
-        if after.mode is Mode.STOPPED:
-            self._hold_all()
-            self.last_stop = self._state_file.save(after.reason)
-        elif after.mode in ARMED and before.mode not in ARMED:
-            self._gate = GateState()
-            self.faults = clear_faults(self.faults, Clear.ON_REARM)
-
-    def _note_late(self, late_s: float, now_s: float) -> None:
-        detail = f"tick {late_s * 1e3:.0f} ms late, {self.overruns_n} overruns"
-        self._own_faults.tell("loop_blocked" if late_s > BLOCKED_S else "tick_overrun", detail, now_s)
-
-    def _note_lapse(self, before: State, after: State, now_s: float) -> None:
-        lapsed = before.lease is not None and after.lease is None and now_s > before.lease.expires_s
-        if lapsed and before.lease is not None and after.mode in ARMED:
-            self._own_faults.tell("lease_lapsed", f"client {before.lease.client or '?'}", now_s, LAPSE_SHOWN_S)
-
-    def _clear_latches(self, commands: tuple[cmd.Command, ...]) -> None:
-        """A reset or an arm lets go of latched faults whose cause is gone; what is still there stays and refuses."""
-        if any(isinstance(command, cmd.Stop) for command in commands):
-            return
-        if any(isinstance(command, cmd.Reset) for command in commands):
-            self.faults = clear_faults(self.faults, Clear.ON_RESET)
-        if self.state.mode is Mode.DISARMED and any(isinstance(command, cmd.Arm) for command in commands):
-            self.faults = clear_faults(self.faults, Clear.ON_REARM)
-
-    def published_faults(self) -> tuple[DeviceFault, ...]:
-        """The active faults as the bus publishes them."""
-        return tuple(
-            DeviceFault(device, condition, fault.detail, fault.since_s)
-            for fault in self.faults.active
-            for device, _, condition in (fault.name.partition("."),)
-        )
-
-    def lifecycle(self, axis: str) -> Lifecycle:
-        """Lifecycle of an axis's device."""
-        return self.devices.all()[axis].lifecycle
-
-
-def _fresh(reading: Reading[float] | None, now_s: float, max_age_s: float) -> float | None:
-    return reading.value if reading is not None and reading.is_fresh(now_s, max_age_s) else None

@@ -8,18 +8,18 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
-from graderd.core.plausibility import AxisSample
 from graderd.hal.errors import DeviceError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
-from graderd.hal.reading import Reading
 from graderd.hal.rotator import Rotator
 
-ACTUATOR_NAMES = ("lift_left", "lift_right", "tilt")
+RETRY_S = 1.0
+
+log = logging.getLogger(__name__)
 
 
 class Link(Protocol):
@@ -61,17 +61,18 @@ class Devices:
     publish_faults: Callable[[tuple[DeviceFault, ...], bool], None] = _publish_nowhere
     """Puts the active faults, and whether the machine is stopped, on the bus as diagnostic messages (DM1)."""
     watch_bus: Callable[[Callable[[str], None]], Callable[[], None]] = _watch_nothing
-    """Calls a listener with every frame on the bus, received or sent, as a line of candump text; returns the call that
-    ends it."""
+    """Calls a listener with every frame on the bus, received or sent, as a line of candump text; returns the call
+    that ends it."""
+    problems: dict[str, str] = field(default_factory=dict)
+    """Why a device, or the bus (``can``), is not open yet; kept by :func:`open_devices`."""
 
     def all(self) -> dict[str, Rotator | LinearActuator]:
         """The axes by device name."""
         return {"rotation": self.rotation, **self.actuators}
 
-    def axis_samples(self) -> tuple[AxisSample, ...]:
-        """What each axis does and was told, for the judgement of its motion; an axis without a valid position: none."""
-        found = (rotation_sample(self.rotation), *(actuator_sample(n, a) for n, a in self.actuators.items()))
-        return tuple(sample for sample in found if sample is not None)
+    def problem_of(self, axis: str) -> str:
+        """Why the axis's device is not open, empty where nothing is known. An actuator waits for its bus."""
+        return self.problems.get(axis, "") or (self.problems.get("can", "") if axis in self.actuators else "")
 
     def hold_all(self) -> tuple[str, ...]:
         """Ask every axis to stop where it is, each in its own try; returns the axes whose driver raised."""
@@ -82,40 +83,6 @@ class Devices:
             except Exception:  # the stop path goes on to the next device whatever this one raised
                 failed.append(name)
         return tuple(failed)
-
-
-def rotation_sample(rotator: Rotator) -> AxisSample | None:
-    """What the rotation does and was told, in degrees; None without a valid angle."""
-    told = rotator.telemetry()
-    powered = rotator.lifecycle is Lifecycle.ACTIVE
-    return _sample("rotation", told.angle_deg, told.velocity_deg_per_s, told.goal_deg, powered, told.current_a)
-
-
-def actuator_sample(name: str, actuator: LinearActuator) -> AxisSample | None:
-    """What an actuator does and was told, in millimetres; None without a valid position."""
-    told = actuator.telemetry()
-    powered = actuator.lifecycle is Lifecycle.ACTIVE
-    return _sample(name, told.position_mm, told.velocity_mm_per_s, told.goal_mm, powered, told.current_a)
-
-
-def _sample(
-    name: str,
-    position: Reading[float] | None,
-    velocity: Reading[float] | None,
-    goal: float | None,
-    powered: bool,
-    current_a: Reading[float] | None,
-) -> AxisSample | None:
-    if position is None or not position.valid:
-        return None
-    return AxisSample(name, position.value, position.time_s, _of(velocity), goal, powered, _of(current_a))
-
-
-def _of(reading: Reading[float] | None) -> float | None:
-    return None if reading is None else reading.value
-
-
-log = logging.getLogger(__name__)
 
 
 class PowerSequencer:
@@ -189,26 +156,18 @@ async def _finished(task: asyncio.Task[None] | None) -> None:
         await asyncio.gather(task, return_exceptions=True)
 
 
-RETRY_S = 1.0
-
-log = logging.getLogger(__name__)
-
-
-async def open_devices(devices: Devices, problems: dict[str, str]) -> None:
-    """Open the bus, then all axes side by side; every failure is told once per cause and tried again.
-
-    ``problems``: why a device is not open yet, by name; kept up to date here.
-    """
+async def open_devices(devices: Devices) -> None:
+    """Open the bus, then all axes side by side; every failure is told once per cause and tried again."""
     async with asyncio.TaskGroup() as group:
-        group.create_task(_keep_trying("rotation", devices.rotation.open, problems), name="open-rotation")
-        group.create_task(_open_bus(devices, problems), name="open-can")
+        group.create_task(_keep_trying("rotation", devices.rotation.open, devices.problems), name="open-rotation")
+        group.create_task(_open_bus(devices), name="open-can")
 
 
-async def _open_bus(devices: Devices, problems: dict[str, str]) -> None:
-    await _keep_trying("can", devices.link.open, problems)
+async def _open_bus(devices: Devices) -> None:
+    await _keep_trying("can", devices.link.open, devices.problems)
     async with asyncio.TaskGroup() as group:
         for name, actuator in devices.actuators.items():
-            group.create_task(_keep_trying(name, actuator.open, problems), name=f"open-{name}")
+            group.create_task(_keep_trying(name, actuator.open, devices.problems), name=f"open-{name}")
 
 
 async def _keep_trying(name: str, open_device: Callable[[], Awaitable[None]], problems: dict[str, str]) -> None:

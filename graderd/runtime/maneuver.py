@@ -37,9 +37,9 @@ class Maneuver:
         await self._obey(cmd.Arm(client=CLIENT))
         try:
             async with asyncio.timeout(ARM_TIMEOUT_S):
-                while self._loop.state.mode is not Mode.MANUAL:
-                    if self._loop.state.arming_since_s is None:
-                        raise DeviceRefusedError("arm", self._loop.state.reason)
+                while (state := self._loop.tick.state).mode is not Mode.MANUAL:
+                    if state.arming_since_s is None:
+                        raise DeviceRefusedError("arm", state.reason)
                     await asyncio.sleep(SAMPLE_S)
         except TimeoutError:
             raise DeviceRefusedError("arm", f"not armed within {ARM_TIMEOUT_S:g} s") from None
@@ -85,5 +85,6 @@ class Maneuver:
             raise
 
     def _check_manual(self) -> None:
-        if self._loop.state.mode is not Mode.MANUAL:
-            raise DeviceLostError("maneuver", f"ended under way: {self._loop.state.reason}")
+        state = self._loop.tick.state
+        if state.mode is not Mode.MANUAL:
+            raise DeviceLostError("maneuver", f"ended under way: {state.reason}")

@@ -8,11 +8,13 @@ from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from typing import Any
 
 from graderd.api.port import ServiceError
+from graderd.config import Config
 from graderd.core.commands import Command, Reply
 from graderd.core.machine import Mode
 from graderd.core.status import Status
 from graderd.hal.errors import DeviceError
 from graderd.runtime.control import ControlLoop
+from graderd.runtime.devices import Devices
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 from graderd.runtime.status import build_status
 
@@ -27,8 +29,17 @@ SERVICES_IN_ANY_MODE = frozenset({"rotation.verify_profile"})
 class Port:
     """Status is built once per tick and only when somebody waits for it."""
 
-    def __init__(self, loop: ControlLoop, eyes: PerceptionSupervisor, services: Mapping[str, Service]) -> None:
+    def __init__(
+        self,
+        config: Config,
+        loop: ControlLoop,
+        devices: Devices,
+        eyes: PerceptionSupervisor,
+        services: Mapping[str, Service],
+    ) -> None:
+        self._config = config
         self._loop = loop
+        self._devices = devices
         self._services = services
         self._eyes = eyes
         self._waiting: list[asyncio.Future[Status]] = []
@@ -47,12 +58,12 @@ class Port:
     def status(self) -> Status:
         """The state at the last control tick."""
         if self._cached is None:
-            self._cached = build_status(self._loop, self._eyes)
+            self._cached = build_status(self._config, self._loop, self._eyes)
         return self._cached
 
     async def next_status(self, after_s: float) -> Status:
         """Wait for a status newer than ``after_s``."""
-        if self._loop.time_s > after_s:
+        if self._loop.tick.now_s > after_s:
             return self.status()
         future: asyncio.Future[Status] = asyncio.get_running_loop().create_future()
         self._waiting.append(future)
@@ -64,7 +75,7 @@ class Port:
 
     def config(self) -> dict[str, Any]:
         """The resolved configuration."""
-        return self._loop.config.model_dump(mode="json")
+        return self._config.model_dump(mode="json")
 
     async def preview_jpeg(self) -> bytes:
         """The newest annotated picture."""
@@ -84,7 +95,7 @@ class Port:
             lines.append(line)
             arrived.set()
 
-        end = self._loop.devices.watch_bus(hear)
+        end = self._devices.watch_bus(hear)
         try:
             while True:
                 await arrived.wait()
@@ -110,8 +121,8 @@ class Port:
                 raise ServiceError(
                     f"{name} may move or unpower the blade", "repeat with consent when the area is clear"
                 )
-            if self._loop.state.mode is not Mode.DISARMED:
-                raise ServiceError(f"{name} needs a disarmed machine; it is {self._loop.state.mode}", "disarm first")
+            if (mode := self._loop.tick.state.mode) is not Mode.DISARMED:
+                raise ServiceError(f"{name} needs a disarmed machine; it is {mode}", "disarm first")
         try:
             return await service(arguments)
         except DeviceError as error:

@@ -1,12 +1,14 @@
-"""Builds the status model from the control loop and its devices."""
+"""Builds the status model from what the last tick knew and decided."""
 
 from __future__ import annotations
 
 from datetime import UTC, datetime
 from importlib.metadata import version
+from typing import Any, TypeVar
 
-from graderd.core.gate import AxisPass
-from graderd.core.lift import attitude_of
+from graderd.config import Config
+from graderd.core.axes import UNITS
+from graderd.core.soil import SoilObservation
 from graderd.core.status import (
     AttitudeStatus,
     AxisStatus,
@@ -18,44 +20,43 @@ from graderd.core.status import (
     Status,
     TickStatus,
 )
-from graderd.hal.linear_actuator import LinearActuator
+from graderd.core.tick import AxisSensed, AxisTick
+from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
-from graderd.hal.rotator import Rotator
+from graderd.hal.rotator import RotatorTelemetry
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
-from graderd.runtime.readiness import requirements
 
+T = TypeVar("T")
 VERSION = version("graderd")
 
 
-def build_status(loop: ControlLoop, eyes: PerceptionSupervisor) -> Status:
+def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) -> Status:
     """The state at the last tick."""
-    now_s = loop.time_s
-    state = loop.state
-    axes = {"rotation": _rotation(loop.devices.rotation, loop.passed.get("rotation"), now_s)}
-    for name, actuator in loop.devices.actuators.items():
-        axes[name] = _actuator(name, actuator, loop.passed.get(name), now_s)
-    decision = state.decision
+    tick, sensed = loop.tick, loop.sensed
+    now_s, state, decision = tick.now_s, tick.state, tick.state.decision
     lateness = sorted(loop.lateness_s)
     return Status(
         time_s=now_s,
         wall_time=datetime.now(UTC).isoformat(timespec="milliseconds"),
         version=VERSION,
-        simulated=loop.config.simulated,
+        simulated=config.simulated,
         mode=state.mode,
         reason=state.reason,
         arming=state.arming_since_s is not None,
         holding=state.holding,
         last_stop=str(loop.last_stop) if loop.last_stop else "",
-        soil=_soil(eyes, now_s),
+        soil=_soil(tick.soil, eyes.frames_per_s, now_s),
         decision=DecisionStatus(
             zone=decision.zone,
             angle_deg=decision.angle_deg,
             age_s=now_s - decision.decided_s if decision.zone is not None else None,
             reason=decision.reason,
         ),
-        axes=axes,
-        attitude=AttitudeStatus.model_validate(attitude_of(loop.config.attitude, loop.pose(now_s))),
+        axes={name: _axis(name, told, tick.axes[name], now_s) for name, told in sensed.axes.items()},
+        attitude=AttitudeStatus(
+            height_mm=tick.attitude.height_mm, slope_deg=tick.attitude.slope_deg, pitch_deg=tick.attitude.pitch_deg
+        ),
         faults=tuple(
             FaultStatus(
                 name=f.name,
@@ -67,27 +68,26 @@ def build_status(loop: ControlLoop, eyes: PerceptionSupervisor) -> Status:
                 age_s=max(0.0, now_s - f.since_s),
                 present=f.present,
             )
-            for f in loop.faults.active
+            for f in tick.faults
         ),
         readiness=tuple(
             RequirementStatus(name=r.name, met=r.met, mandatory=r.mandatory, reason=r.reason, remedy=r.remedy)
-            for r in requirements(loop, now_s)
+            for r in tick.readiness
         ),
         lease=LeaseStatus(client=state.lease.client, remaining_s=max(0.0, state.lease.expires_s - now_s))
         if state.lease
         else None,
         camera=eyes.status(),
         tick=TickStatus(
-            rate_hz=loop.config.control.tick_hz,
-            overruns_n=loop.overruns_n,
+            rate_hz=config.control.tick_hz,
+            overruns_n=tick.overruns_n,
             lateness_p99_ms=lateness[int(0.99 * (len(lateness) - 1))] * 1e3 if lateness else 0.0,
         ),
-        presets=tuple(loop.config.presets),
+        presets=tuple(config.presets),
     )
 
 
-def _soil(eyes: PerceptionSupervisor, now_s: float) -> SoilStatus:
-    newest = eyes.newest
+def _soil(newest: SoilObservation | None, frames_per_s: float, now_s: float) -> SoilStatus:
     if newest is None:
         return SoilStatus()
     return SoilStatus(
@@ -103,61 +103,52 @@ def _soil(eyes: PerceptionSupervisor, now_s: float) -> SoilStatus:
         volume_right_l=newest.volume_right_l,
         blade_angle_deg=newest.blade_angle_deg,
         frame_number_n=newest.frame_number,
-        frames_per_s=eyes.frames_per_s,
+        frames_per_s=frames_per_s,
         method=newest.method,
     )
 
 
-def _rotation(rotator: Rotator, passed: AxisPass | None, now_s: float) -> AxisStatus:
-    told = rotator.telemetry()
-    return AxisStatus(
-        name="rotation",
-        unit="deg",
-        lifecycle=rotator.lifecycle,
-        requested=passed.requested if passed else None,
-        limited=passed.limited if passed else None,
-        limited_because=passed.reason if passed else "",
-        sent=_value(told.goal_sent_deg),
-        measured=_value(told.angle_deg),
-        measured_age_s=told.angle_deg.age_s(now_s) if told.angle_deg else None,
-        velocity_per_s=_value(told.velocity_deg_per_s),
-        current_a=_value(told.current_a),
-        torque_nm=_value(told.torque_nm),
-        voltage_v=_value(told.voltage_v),
-        temperature_c=_value(told.temperature_c),
-        moving=_flag(told.moving),
-        in_position=_flag(told.in_position),
-        torque_on=_flag(told.torque_on),
-        counters=told.counters,
-    )
-
-
-def _actuator(name: str, actuator: LinearActuator, passed: AxisPass | None, now_s: float) -> AxisStatus:
-    told = actuator.telemetry()
+def _axis(name: str, axis: AxisSensed, decided: AxisTick, now_s: float) -> AxisStatus:
+    told = axis.telemetry
     return AxisStatus(
         name=name,
-        unit="mm",
-        lifecycle=actuator.lifecycle,
-        requested=passed.requested if passed else None,
-        limited=passed.limited if passed else None,
-        limited_because=passed.reason if passed else "",
-        sent=_value(told.target_sent_mm),
-        measured=_value(told.position_mm),
-        measured_age_s=told.position_mm.age_s(now_s) if told.position_mm else None,
-        velocity_per_s=_value(told.velocity_mm_per_s),
+        unit=UNITS[name],
+        lifecycle=axis.lifecycle,
+        requested=decided.requested,
+        limited=decided.limited,
+        limited_because=decided.because,
+        arrived=decided.arrived,
+        measured=_value(told.position),
+        measured_age_s=told.position.age_s(now_s) if told.position else None,
         current_a=_value(told.current_a),
-        duty_percent=_value(told.duty_percent),
-        moving=_flag(told.moving),
-        thermal_load=told.thermal_load,
-        flags=tuple(sorted(told.flags.value)) if told.flags else (),
+        moving=_value(told.moving),
         counters=told.counters,
+        **(_rotator(told) if isinstance(told, RotatorTelemetry) else _actuator(told)),
     )
 
 
-def _value(reading: Reading[float] | None) -> float | None:
+def _rotator(told: RotatorTelemetry) -> dict[str, Any]:
+    return {
+        "sent": _value(told.goal_sent_deg),
+        "velocity_per_s": _value(told.velocity_deg_per_s),
+        "torque_nm": _value(told.torque_nm),
+        "voltage_v": _value(told.voltage_v),
+        "temperature_c": _value(told.temperature_c),
+        "in_position": _value(told.in_position),
+        "torque_on": _value(told.torque_on),
+    }
+
+
+def _actuator(told: ActuatorTelemetry) -> dict[str, Any]:
+    return {
+        "sent": _value(told.target_sent_mm),
+        "velocity_per_s": _value(told.velocity_mm_per_s),
+        "duty_percent": _value(told.duty_percent),
+        "thermal_load": told.thermal_load,
+        "flags": tuple(sorted(told.flags.value)) if told.flags else (),
+    }
+
+
+def _value(reading: Reading[T] | None) -> T | None:
     """For show only, beside its age; control uses readings with a maximum age."""
-    return reading.value if reading is not None and reading.valid else None
-
-
-def _flag(reading: Reading[bool] | None) -> bool | None:
     return reading.value if reading is not None and reading.valid else None

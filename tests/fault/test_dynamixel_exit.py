@@ -28,7 +28,7 @@ import asyncio, sys
 from graderd.drivers.dynamixel import Ph54Rotator
 from graderd.hal.settings import RotatorSettings
 async def main():
-    r = Ph54Rotator(RotatorSettings(port=sys.argv[1], velocity_deg_per_s=20.0))
+    r = Ph54Rotator(RotatorSettings(port=sys.argv[1], speed_deg_per_s=16.7))
     await r.open()
     await r.arm()
     while True:

@@ -178,7 +178,7 @@ async def test_lost_turns_behind_a_gear_need_a_person(tmp_path: Path) -> None:
     servo = VirtualServo()
     servo.memory["operating_mode"] = 4
     servo.shaft_deg = 400.0
-    async with bench(tmp_path, servo, gear_ratio=10.0, velocity_deg_per_s=10.0) as rig:
+    async with bench(tmp_path, servo, gear_ratio=10.0, speed_deg_per_s=8.3) as rig:
         assert rig.at(40.0)()
         await rig.rotator.arm()
         await rig.drive(45.0, rig.at(45.0))

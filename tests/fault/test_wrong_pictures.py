@@ -62,10 +62,10 @@ class Grader:
 
     async def tick(self) -> None:
         self.machine.clock.advance(TICK_S)
-        before_s = self.loop.state.decision.decided_s
-        self.loop.tick()
+        before_s = self.loop.tick.state.decision.decided_s
+        self.loop.turn()
         await asyncio.sleep(0)
-        decision = self.loop.state.decision
+        decision = self.loop.tick.state.decision
         if decision.decided_s != before_s and decision.zone is not None:
             self.run.decided_s.append(decision.decided_s)
             self.run.decided.append(decision.zone)
@@ -94,12 +94,12 @@ class Grader:
             await self.tick()
 
     def judge(self) -> None:
-        gate = self.config.gate
-        low, high = gate.rotation_min_deg, gate.rotation_max_deg
+        rotation = self.config.rotation
+        low, high = rotation.min_deg, rotation.max_deg
         assert all(low <= angle <= high for angle in self.run.angles_deg)
         decided = self.run.decided_s
         assert all(later - earlier >= self.config.rule.dwell_s - 1e-9 for earlier, later in pairwise(decided))
-        fastest_deg = gate.rotation_speed_deg_per_s * TICK_S
+        fastest_deg = rotation.speed_deg_per_s * TICK_S
         steps = [abs(b - a) for a, b in pairwise(self.run.angles_deg)]
         assert max(steps, default=0.0) <= fastest_deg + 1e-6
         # A swing is a way of a few degrees in one direction: no more of them than decisions that asked for one.
@@ -152,7 +152,7 @@ async def test_five_seconds_of_nonsense(tmp_path: Path, seed: int) -> None:
     for _ in range(120):
         await grader.see(picture(grader.machine.clock.now_s(), Zone.LEFT))
     grader.judge()
-    assert grader.loop.state.mode is Mode.AUTO
+    assert grader.loop.tick.state.mode is Mode.AUTO
     assert grader.machine.rotation.position == pytest.approx(30.0, abs=0.6)
     await grader.close()
 

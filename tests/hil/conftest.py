@@ -34,12 +34,14 @@ DROP_IN = Path("/etc/systemd/system/graderd.service.d")
 # 0.2 s longer patience where the whole guest may stand still for that long.
 FOR_THE_GUEST: dict[str, object] = {
     "rotation.poll_hz": 25.0,
-    "rotation.velocity_deg_per_s": 12.0,  # so that a test can look while it turns
+    "rotation.speed_deg_per_s": 10.0,  # so that a test can look while it turns
     "rotation.watchdog_s": 0.4,
     "rotation.goal_timeout_s": 0.4,
     "rotation.reply_timeout_s": 0.5,
-    "control.rotation_max_age_s": 0.4,
-    "control.actuator_max_age_s": 0.6,
+    "rotation.max_age_s": 0.4,
+    "lift_left.max_age_s": 0.6,
+    "lift_right.max_age_s": 0.6,
+    "tilt.max_age_s": 0.6,
     "control.overrun_s": 0.3,
     "lift_pair.reading_max_age_s": 0.6,
     **{

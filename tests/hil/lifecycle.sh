@@ -26,7 +26,7 @@ getent passwd graderd >/dev/null || fail "no user graderd"
 
 # The guest has one slow processor for all of it: smaller pictures, more patience (conftest.py says why).
 for setting in color_width_px=640 color_height_px=400 depth_width_px=424 depth_height_px=240 lease_s=3.0 \
-    watchdog_s=0.6 goal_timeout_s=0.6 reply_timeout_s=0.8 rotation_max_age_s=0.6 actuator_max_age_s=0.8 feedback_timeout_s=0.8 \
+    watchdog_s=0.6 goal_timeout_s=0.6 reply_timeout_s=0.8 max_age_s=0.8 feedback_timeout_s=0.8 \
     overrun_s=0.5; do
     sed -i "s/^#${setting%=*} = .*/${setting%=*} = ${setting#*=}/" /etc/graderd/graderd.toml
 done

@@ -15,8 +15,9 @@ from graderd.api.port import ServiceError
 from graderd.api.server import serve
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.core import commands as cmd
+from graderd.core.axes import JOG_AXES, UNITS, Goals, Pose
 from graderd.core.faults.monitor import ActiveFault
-from graderd.core.machine import Goals, Inputs, Lease, MachineSettings, Mode, Pose, State, Unmet, step
+from graderd.core.machine import Inputs, Lease, MachineSettings, Mode, State, Unmet, step
 from graderd.core.rule import RuleSettings
 from graderd.core.status import (
     AttitudeStatus,
@@ -113,9 +114,6 @@ class FakeDaemon:
             if arguments.get("consent") is not True:
                 raise ServiceError("a reboot lets the blade turn freely for a moment", "send consent: true")
             return {"rebooted": True}
-        if name == "slow":
-            await asyncio.sleep(float(arguments["seconds"]))
-            return {}
         raise ServiceError(f"there is no service {name}", "see /v1/openapi.json")
 
     def _tick(self, now_s: float) -> None:
@@ -182,7 +180,7 @@ class FakeDaemon:
         }[command.axis]
         value = command.value + (now or 0.0) if command.relative else command.value
         if abs(value) > LIMITS[command.axis]:
-            unit = cmd.AXIS_UNITS[command.axis]
+            unit = JOG_AXES[command.axis].unit
             return f"{command.axis} {value:+.1f} {unit} is beyond the limit of {LIMITS[command.axis]:+.1f} {unit}"
         match command.axis:
             case "rotate":
@@ -210,11 +208,12 @@ class FakeDaemon:
         axes = {
             name: AxisStatus(
                 name=name,
-                unit="deg" if name == "rotation" else "mm",
+                unit=UNITS[name],
                 lifecycle=lifecycle,
                 requested=requested[name],
                 limited=None if name in self.held else requested[name],
                 sent=requested[name],
+                arrived=requested[name] == position,
                 measured=position,
                 measured_age_s=0.01,
                 moving=name in self._moving,

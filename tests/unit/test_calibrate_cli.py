@@ -27,7 +27,7 @@ from tests.perception_scenes import Scene, render
 
 Captured = pytest.CaptureFixture[str]
 COLOR, DEPTH = (480, 300), (424, 240)
-CONFIG = '# mine\n[perception]\nmethod = "depth"  # on purpose\n\n[rotation]\nvelocity_deg_per_s = 20.0\n'
+CONFIG = '# mine\n[perception]\nmethod = "depth"  # on purpose\n\n[rotation]\nspeed_deg_per_s = 20.0\n'
 
 
 def sized(calibration: CameraCalibration) -> CameraCalibration:

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from graderd.api.settings import ApiLimits
 from graderd.cli.console import CliError
-from graderd.cli.move import UNITS, VALUE, Arrival, JogValue, parse_value
+from graderd.cli.move import VALUE, Arrival, JogValue, parse_value
+from graderd.core.axes import JOG_AXES, JogName
 from graderd.core.machine import Mode
 from graderd.core.status import FaultStatus
 from tests.unit.api_daemon import FakeDaemon, serving, within
@@ -36,7 +37,7 @@ from tests.unit.test_cli_modes import Capture, cli, command_line
         ("pitch", "-1.25deg", JogValue(-1.25, True)),
     ],
 )
-def test_values(axis: str, text: str, expected: JogValue) -> None:
+def test_values(axis: JogName, text: str, expected: JogValue) -> None:
     assert parse_value(axis, text) == expected
 
 
@@ -56,15 +57,15 @@ def test_values(axis: str, text: str, expected: JogValue) -> None:
         ("rotate", "9" * 400 + "deg", "is no value"),
     ],
 )
-def test_what_is_no_value(axis: str, text: str, says: str) -> None:
+def test_what_is_no_value(axis: JogName, text: str, says: str) -> None:
     with pytest.raises(CliError) as error:
         parse_value(axis, text)
     assert says in error.value.cause
     assert error.value.exit_code == 2
 
 
-@given(st.sampled_from(list(UNITS)), st.text(max_size=20) | st.from_regex(VALUE))
-def test_whatever_is_typed_is_a_finite_value_or_bad_usage(axis: str, text: str) -> None:
+@given(st.sampled_from(list(JOG_AXES)), st.text(max_size=20) | st.from_regex(VALUE))
+def test_whatever_is_typed_is_a_finite_value_or_bad_usage(axis: JogName, text: str) -> None:
     value: float | None
     try:
         value = parse_value(axis, text).value
@@ -128,7 +129,15 @@ async def test_refused_jogs_move_nothing(
 
 def lifts(time_s: float, limited: float | None, *faults: str) -> dict[str, Any]:
     """What the stream says of two lifts on their way to 130 mm."""
-    axis = {"unit": "mm", "measured": 110.0, "requested": 130.0, "limited": limited, "limited_because": "", "moving": 0}
+    axis = {
+        "unit": "mm",
+        "limited_because": "",
+        "measured": 110.0,
+        "requested": 130.0,
+        "limited": limited,
+        "arrived": False,
+        "moving": 0,
+    }
     axes = {name: {"name": name, **axis} for name in ("lift_left", "lift_right")}
     present = [
         {"name": n, "present": True, "detail": "7.7 mm apart", "reads": "", "remedy": "level it"} for n in faults

@@ -25,8 +25,8 @@ def test_no_file_is_the_defaults() -> None:
 
 def test_an_unknown_key_names_line_and_nearest_right_one(tmp_path: Path) -> None:
     path = tmp_path / "graderd.toml"
-    (problem,) = problems("# site 7\n[rotation]\nvelocty_deg_per_s = 20\n", path)
-    assert problem == f"{path}:3: rotation.velocty_deg_per_s: unknown key. Did you mean rotation.velocity_deg_per_s?"
+    (problem,) = problems("# site 7\n[rotation]\nsped_deg_per_s = 20\n", path)
+    assert problem == f"{path}:3: rotation.sped_deg_per_s: unknown key. Did you mean rotation.speed_deg_per_s?"
     (problem,) = problems("[rotaton]\nport = 'x'\n", path)
     assert "Did you mean rotation?" in problem
     (problem,) = problems("[perception.depth]\ncel_m = 0.01\n", path)
@@ -43,12 +43,12 @@ def test_all_mistakes_at_once(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("[rotation]\nmin_deg = 10\nmax_deg = -10\n", "min_deg (10.0) must be below max_deg (-10.0)"),
-        ("[rule]\nleft_deg = 80\n", "rule.left_deg (80) lies outside gate"),
+        ("[rule]\nleft_deg = 80\n", "rule.left_deg (80) lies outside rotation.min_deg"),
         ("[camera]\nrate_hz = 1.9\n", "until their product is 3 or more"),
         ("[lift_left]\naddress_n = 20\n", "four different addresses"),
         ("[rule]\nleft_deg = nan\n", "finite"),
         ("[control]\nshutdown_order = ['rotation']\n", "shutdown_order"),
-        ("version = 2\n", "version"),
+        ("version = 3\n", "version"),
     ],
 )
 def test_values_that_make_no_sense_together(tmp_path: Path, text: str, said: str) -> None:

@@ -11,17 +11,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graderd.core.gate import AXES, AxisLimits, GateInputs, GateSettings, GateState, Setpoint, pass_gate
-from graderd.core.machine import ARMED, Goals, Mode, Pose
+from graderd.config import Config
+from graderd.core.axes import AXES, Goals, Pose
+from graderd.core.gate import GateInputs, GateSettings, GateState, Setpoint, pass_gate
+from graderd.core.machine import ARMED, Mode
+from graderd.hal.settings import ActuatorSettings, RotatorSettings
 
 SETTINGS = GateSettings()
+FIGURES = Config().figures()
 POSE = Pose(0.0, 100.0, 100.0, 50.0)
 DT_S = 0.02
 FIELDS = {"rotation": "rotation_deg", "lift_left": "lift_left_mm", "lift_right": "lift_right_mm", "tilt": "tilt_mm"}
 
 
 def inputs(**changes: object) -> GateInputs:
-    return replace(GateInputs(SETTINGS, Mode.MANUAL, POSE, DT_S, lease_ok=True, height_mm=0.0), **changes)  # type: ignore[arg-type]
+    return replace(GateInputs(SETTINGS, FIGURES, Mode.MANUAL, POSE, DT_S, lease_ok=True, height_mm=0.0), **changes)  # type: ignore[arg-type]
 
 
 def goal(axis: str, value: float) -> Goals:
@@ -87,7 +91,7 @@ def test_no_motion_without_the_lease(axis: str) -> None:
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("side", ["low", "high"])
 def test_absolute_limits_swept_densely(axis: str, side: str) -> None:
-    limits = SETTINGS.limits()[axis]
+    limits = FIGURES[axis]
     bound = getattr(limits, side)
     start = replace(POSE, **{FIELDS[axis]: bound - 1.0 if side == "high" else bound + 1.0})
     for step in range(-40, 41):
@@ -104,22 +108,22 @@ def test_absolute_limits_swept_densely(axis: str, side: str) -> None:
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_window_around_the_armed_pose(axis: str, sign: float) -> None:
-    narrow = SETTINGS.model_copy(update={"rotation_window_deg": 5.0, "lift_window_mm": 5.0, "tilt_window_mm": 5.0})
+    narrow = {axis: replace(figures, window=5.0) for axis, figures in FIGURES.items()}
     start = getattr(POSE, FIELDS[axis])
     for step in range(-20, 21):
         offset = 5.0 + step * 0.05
-        seen = drive(goal(axis, start + sign * offset), inputs(settings=narrow), 300)
+        seen = drive(goal(axis, start + sign * offset), inputs(figures=narrow), 300)
         end = seen[-1][axis]
         assert end is not None
         assert abs(end - start) <= 5.0 + 1e-9
         assert end == pytest.approx(start + sign * min(offset, 5.0), abs=1e-9)
-    _, passed = pass_gate(GateState(), goal(axis, start + sign * 5.1), inputs(settings=narrow))
+    _, passed = pass_gate(GateState(), goal(axis, start + sign * 5.1), inputs(figures=narrow))
     assert "window" in passed[axis].reason
 
 
 @pytest.mark.parametrize("axis", AXES)
 def test_speed_and_acceleration_are_limited_and_it_arrives_without_overshoot(axis: str) -> None:
-    limits = SETTINGS.limits()[axis]
+    limits = FIGURES[axis]
     start = getattr(POSE, FIELDS[axis])
     wanted = start + 0.6 * (limits.high - start)
     path = [start, *[tick[axis] for tick in drive(goal(axis, wanted), inputs(), 1500)]]
@@ -137,7 +141,7 @@ def test_speed_and_acceleration_are_limited_and_it_arrives_without_overshoot(axi
 @given(st.lists(st.tuples(st.floats(-200, 200), st.booleans()), min_size=1, max_size=60))
 @settings(max_examples=200)
 def test_whatever_is_asked_the_goal_stays_inside_and_slow(asked: list[tuple[float, bool]]) -> None:
-    limits = SETTINGS.limits()["rotation"]
+    limits = FIGURES["rotation"]
     state, pose, last = GateState(), POSE, 0.0
     for value, lease in asked:
         state, passed = pass_gate(state, Goals(rotation_deg=value), inputs(pose=pose, lease_ok=lease))
@@ -155,7 +159,7 @@ def test_whatever_is_asked_the_goal_stays_inside_and_slow(asked: list[tuple[floa
 @pytest.mark.parametrize("share", [0.0, 0.31, 0.83, 1.0])
 def test_late_ticks_do_not_carry_it_past_a_standing_goal(axis: str, share: float) -> None:
     """On a busy machine ticks come late, and with them the braking; the axis's own limits are among the goals."""
-    limits = SETTINGS.limits()[axis]
+    limits = FIGURES[axis]
     wanted = limits.low + share * (limits.high - limits.low)
     for seed in range(30):
         ticks = random.Random(seed)
@@ -174,11 +178,11 @@ def test_late_ticks_do_not_carry_it_past_a_standing_goal(axis: str, share: float
 @given(st.lists(st.tuples(st.floats(-70, 70), st.sampled_from((0.005, 0.02, 0.05, 0.2))), min_size=1, max_size=80))
 @settings(max_examples=200)
 def test_with_goals_that_change_and_ticks_that_are_late_it_stays_inside(asked: list[tuple[float, float]]) -> None:
-    narrow = SETTINGS.model_copy(update={"rotation_window_deg": 8.0})
-    for given_settings, low, high in ((SETTINGS, -60.0, 60.0), (narrow, 42.0, 58.0)):
+    narrow = FIGURES | {"rotation": replace(FIGURES["rotation"], window=8.0)}
+    for figures, low, high in ((FIGURES, -60.0, 60.0), (narrow, 42.0, 58.0)):
         state, pose = GateState(), replace(POSE, rotation_deg=50.0)
         for value, dt_s in asked:
-            step = inputs(settings=given_settings, pose=pose, dt_s=dt_s)
+            step = inputs(figures=figures, pose=pose, dt_s=dt_s)
             state, passed = pass_gate(state, Goals(rotation_deg=value), step)
             limited = passed["rotation"].limited
             assert limited is not None
@@ -187,7 +191,7 @@ def test_with_goals_that_change_and_ticks_that_are_late_it_stays_inside(asked: l
 
 
 def test_a_goal_moved_nearer_than_the_way_to_stop_is_passed_and_come_back_to() -> None:
-    limits = SETTINGS.limits()["rotation"]
+    limits = FIGURES["rotation"]
     way_to_stop = limits.speed**2 / (2.0 * limits.acceleration)
     state = GateState({"rotation": Setpoint(0.0, limits.speed, 0.0)})
     seen, pose = [0.0], POSE
@@ -236,7 +240,7 @@ def test_after_a_hold_it_starts_again_from_the_measured_position_at_rest() -> No
     assert passed["rotation"].limited is None
     assert (state.setpoints["rotation"].position, state.setpoints["rotation"].speed) == (-3.0, 0.0)
     state, passed = pass_gate(state, goal("rotation", 40.0), inputs(pose=pushed))
-    limits = SETTINGS.limits()["rotation"]
+    limits = FIGURES["rotation"]
     assert passed["rotation"].limited == pytest.approx(-3.0 + limits.acceleration * DT_S * DT_S)
 
 
@@ -252,7 +256,7 @@ def test_a_measurement_lost_in_motion_holds_and_keeps_the_armed_pose() -> None:
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_a_jammed_axis_is_not_led_far(axis: str, sign: float) -> None:
-    limits = SETTINGS.limits()[axis]
+    limits = FIGURES[axis]
     start = getattr(POSE, FIELDS[axis])
     wanted = limits.high if sign > 0 else limits.low
     seen = [tick[axis] for tick in drive(goal(axis, wanted), inputs(), 400, follow=False)]
@@ -296,6 +300,6 @@ def test_armed_modes_move(mode: Mode) -> None:
 
 def test_limits_in_the_wrong_order_are_refused() -> None:
     with pytest.raises(ValueError, match="below"):
-        AxisLimits(low=1.0, high=1.0, window=1.0, speed=1.0, acceleration=1.0, lead=1.0)
+        RotatorSettings(min_deg=10.0, max_deg=10.0)
     with pytest.raises(ValueError, match="below"):
-        GateSettings(rotation_min_deg=10.0, rotation_max_deg=-10.0)
+        ActuatorSettings(min_mm=10.0, max_mm=5.0)

@@ -17,7 +17,9 @@ from typing import Any
 
 import pytest
 
+from graderd.config import Config
 from graderd.core import commands as cmd
+from graderd.core.axes import AXES, Goals, Pose
 from graderd.core.faults.catalogue import _by_key, find_rows
 from graderd.core.faults.monitor import (
     ALL_AXES,
@@ -32,8 +34,8 @@ from graderd.core.faults.monitor import (
     update_faults,
     worst,
 )
-from graderd.core.gate import AXES, GateInputs, GateSettings, GateState, Setpoint, pass_gate
-from graderd.core.machine import Goals, MachineSettings, Mode, Pose, State, Step, Unmet, step
+from graderd.core.gate import GateInputs, GateSettings, GateState, Setpoint, pass_gate
+from graderd.core.machine import MachineSettings, Mode, State, Step, Unmet, step
 from graderd.core.rule import RuleSettings
 from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.fault import DeviceFault
@@ -41,6 +43,7 @@ from tests.unit.test_core_machine import EVENTS, NOW_S, STATES, do, fault
 
 GOLDEN = Path(__file__).parent / "golden" / "core.json"
 MACHINE, RULE = MachineSettings(), RuleSettings()
+GATE, FIGURES = GateSettings(), Config().figures()
 
 
 def plain(value: Any) -> Any:
@@ -129,7 +132,8 @@ def automatic_answers() -> Iterator[tuple[str, Any]]:
 
 
 def gate_answers() -> Iterator[tuple[str, Any]]:
-    settings = GateSettings(rotation_window_deg=40.0, lift_window_mm=50.0, tilt_window_mm=20.0)
+    windows = {"rotation": 40.0, "lift_left": 50.0, "lift_right": 50.0, "tilt": 20.0}
+    narrow = {axis: replace(figures, window=windows[axis]) for axis, figures in FIGURES.items()}
     high = GateSettings(rotation_min_height_mm=30.0)
     pose = Pose(5.0, 100.0, 110.0, 50.0)
     nan = Pose(math.nan, 100.0, math.inf, 50.0)
@@ -148,8 +152,8 @@ def gate_answers() -> Iterator[tuple[str, Any]]:
         for tick in range(160 if mode is Mode.MANUAL and lease_ok else 10):
             now = nan if tick == 3 else Pose() if tick == 4 else pose
             height_mm = None if tick < 2 else 20.0 if tick < 6 else 30.0
-            used = high if 0 < tick < 9 else settings
-            inputs = GateInputs(used, mode, now, 0.0 if tick == 5 else 0.02, lease_ok, height_mm)
+            used = (high, FIGURES) if 0 < tick < 9 else (GATE, narrow)
+            inputs = GateInputs(*used, mode, now, 0.0 if tick == 5 else 0.02, lease_ok, height_mm)
             state, passed = pass_gate(state, goals, inputs)
             pose_now = {axis: passed[axis].limited for axis in AXES}
             pose = Pose(
@@ -168,40 +172,39 @@ def gate_answers() -> Iterator[tuple[str, Any]]:
 def late_answers() -> Iterator[tuple[str, Any]]:
     """Ticks of uneven length, on the way to a goal that stands and to one nearer than the way to stop."""
     pose = Pose(0.0, 100.0, 100.0, 50.0)
-    settings = GateSettings()
     for goal_deg, pattern in product((35.0, -12.0, 0.4), ((0.02, 0.2), (0.001, 0.08, 0.02), (0.2,), (0.02, 0.021))):
         state, rows = GateState(), []
         for tick in range(60):
-            inputs = GateInputs(settings, Mode.MANUAL, pose, pattern[tick % len(pattern)], True)
+            inputs = GateInputs(GATE, FIGURES, Mode.MANUAL, pose, pattern[tick % len(pattern)], True)
             state, passed = pass_gate(state, Goals(goal_deg), inputs)
             rows.append(passed["rotation"].limited)
         yield f"to {goal_deg} with ticks of {pattern}", plain(rows)
-    limits = settings.limits()["rotation"]
+    limits = FIGURES["rotation"]
     shares = (0.02, 0.1, 0.3, 0.5, 0.8, 0.99, 1.0, 1.05, 1.4, 3.0)
     for share, speed, dt_s in product(shares, (0.3, 0.9, 1.5, -6.0), (0.02, 0.1, 0.2)):
         way_deg = math.copysign(share * speed**2 / (2.0 * limits.acceleration), speed)
         state = GateState({"rotation": Setpoint(0.0, speed, 0.0)})
-        state, _ = pass_gate(state, Goals(way_deg), GateInputs(settings, Mode.MANUAL, pose, dt_s, True))
+        state, _ = pass_gate(state, Goals(way_deg), GateInputs(GATE, FIGURES, Mode.MANUAL, pose, dt_s, True))
         # ending at the goal and passing it are told apart by the speed that is left
         yield f"{share} of the way to stop from {speed}, {dt_s}", plain(asdict(state.setpoints["rotation"]))
     for goal_deg, dt_s in product((70.0, -70.0, 60.0), (0.01, 0.02, 0.2)):
         near, speed = math.copysign(59.9, goal_deg), math.copysign(limits.speed, goal_deg)
         state = GateState({"rotation": Setpoint(near, speed, near)})
         there = Pose(near, 100.0, 100.0, 50.0)
-        state, _ = pass_gate(state, Goals(goal_deg), GateInputs(settings, Mode.MANUAL, there, dt_s, True))
+        state, _ = pass_gate(state, Goals(goal_deg), GateInputs(GATE, FIGURES, Mode.MANUAL, there, dt_s, True))
         yield f"fast at the limit, to {goal_deg}, {dt_s}", plain(asdict(state.setpoints["rotation"]))
     for part, dt_s in product((0.99, 1.01, 1.05, 1.2), (0.2, 0.5, 1.0)):
         state = GateState({"rotation": Setpoint(0.0, limits.speed, 0.0)})
         goals = Goals(part * limits.speed * dt_s)
-        state, _ = pass_gate(state, goals, GateInputs(settings, Mode.MANUAL, pose, dt_s, True))
+        state, _ = pass_gate(state, goals, GateInputs(GATE, FIGURES, Mode.MANUAL, pose, dt_s, True))
         yield f"{part} of a tick's way in {dt_s}", plain(asdict(state.setpoints["rotation"]))
 
 
 def bound_answers() -> Iterator[tuple[str, Any]]:
     """A window that ends exactly where the limit is: the limit is named."""
-    settings = GateSettings(rotation_window_deg=60.0)
+    figures = FIGURES | {"rotation": replace(FIGURES["rotation"], window=60.0)}
     for goal_deg in (-61.0, -60.0, 60.0, 61.0):
-        inputs = GateInputs(settings, Mode.MANUAL, Pose(0.0, 100.0, 100.0, 50.0), 0.02, True)
+        inputs = GateInputs(GATE, figures, Mode.MANUAL, Pose(0.0, 100.0, 100.0, 50.0), 0.02, True)
         yield f"window equals limit, {goal_deg}", pass_gate(GateState(), Goals(goal_deg), inputs)[1]["rotation"].reason
 
 

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from graderd.core import commands as cmd
+from graderd.core.axes import Goals, Pose
 from graderd.core.faults.monitor import ALL_AXES, ActiveFault, Clear, FaultRow, Reaction
-from graderd.core.machine import ARMED, Goals, Inputs, MachineSettings, Mode, Pose, State, Step, Unmet, step
+from graderd.core.machine import ARMED, Inputs, MachineSettings, Mode, State, Step, Unmet, step
 from graderd.core.rule import Decision, RuleSettings
 from graderd.core.soil import SoilObservation, Zone
 

@@ -13,8 +13,9 @@ from itertools import product
 import pytest
 
 from graderd.core import commands as cmd
+from graderd.core.axes import Goals, Pose
 from graderd.core.faults.monitor import ALL_AXES, ActiveFault, Clear, FaultRow, Reaction
-from graderd.core.machine import ARMED, Goals, Inputs, Lease, MachineSettings, Mode, Pose, State, Step, Unmet, step
+from graderd.core.machine import ARMED, Inputs, Lease, MachineSettings, Mode, State, Step, Unmet, step
 from graderd.core.rule import Decision, RuleSettings
 from graderd.core.soil import SoilObservation, Zone
 

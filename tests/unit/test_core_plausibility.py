@@ -10,16 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from graderd.config import Config
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import catalogue_key
-from graderd.core.gate import GateSettings
-from graderd.core.plausibility import AxisSample, PlausibilityMonitor, axis_figures
+from graderd.core.plausibility import AxisSample, PlausibilityMonitor, motion_figures
 from graderd.drivers.dynamixel.arming import HOLD_ACCELERATION_FACTOR
 from graderd.hal.settings import RotatorSettings
 from graderd.simulator.servo.motion import Profile, Trajectory
 
-ROTATION = RotatorSettings()
-FIGURES = axis_figures(ROTATION, {axis: limit.speed for axis, limit in GateSettings().limits().items()})
+FIGURES = motion_figures(Config().rotation, Config().figures())
 TICK_S = 0.02
 FEEDBACK_S = 0.105
 Course = Callable[[float], float]
@@ -103,8 +102,9 @@ def test_a_servo_that_obeys_raises_nothing_whatever_it_is_told(
     moves: list[tuple[float, float, bool]], top: float, acceleration: float
 ) -> None:
     """Goals, reversals and holds in mid-turn, at the profile's own speed and braking; a hold brakes harder."""
-    rotation = RotatorSettings(velocity_deg_per_s=top, acceleration_deg_per_s2=acceleration)
-    monitor = PlausibilityMonitor(axis_figures(rotation, {"rotation": 25.0}))
+    rotation = RotatorSettings(speed_deg_per_s=top, acceleration_deg_per_s2=acceleration)
+    top, acceleration = rotation.profile_velocity_deg_per_s, rotation.profile_acceleration_deg_per_s2
+    monitor = PlausibilityMonitor(motion_figures(rotation, Config(rotation=rotation).figures()))
     trajectory, now_s = Trajectory(), 0.0
     for goal_deg, lasts_s, held in moves:
         trajectory.goal_deg = trajectory.position_deg if held else goal_deg

@@ -9,9 +9,9 @@ import pytest
 
 from graderd.cli.app import run_app
 from graderd.cli.docs import pages
+from graderd.core.axes import ACTUATORS
 from graderd.core.faults.catalogue import CATALOGUE, find_rows
 from graderd.core.faults.monitor import (
-    ACTUATORS,
     ALL_AXES,
     Clear,
     FaultRow,

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from graderd.config import Config, ConfigError, load
+from graderd.config import Config, ConfigError, load, parse
 from graderd.config.migrate import CURRENT_VERSION, Document, migrate_file, migrate_text, rename
+from graderd.core.axes import ACTUATORS
 
 PROJECT = Path(__file__).resolve().parents[2]
 
@@ -31,7 +32,7 @@ def to_1(document: Document) -> list[str]:
     return rename(document, "servo", "rotation") + rename(document, "actuators.left", "lift_left")
 
 
-STEPS = {0: to_1}
+STEPS = {0: to_1, 1: lambda _: []}
 
 
 def test_migration_keeps_values_and_comments_and_leaves_a_backup(tmp_path: Path) -> None:
@@ -54,7 +55,7 @@ def test_migration_keeps_values_and_comments_and_leaves_a_backup(tmp_path: Path)
 
 def test_a_present_file_is_not_touched(tmp_path: Path) -> None:
     path = tmp_path / "graderd.toml"
-    path.write_text("version=1   # odd spacing stays\n", encoding="utf-8")
+    path.write_text(f"version={CURRENT_VERSION}   # odd spacing stays\n", encoding="utf-8")
     before = path.stat()
     assert migrate_file(path, STEPS) == (None, [])
     assert path.stat().st_mtime_ns == before.st_mtime_ns
@@ -94,3 +95,43 @@ def test_the_installed_file_names_every_key_and_gives_the_defaults(tmp_path: Pat
     text = path.read_text(encoding="utf-8")
     for key in ("zero_deg", "usb_serial_number", "source_address_n", "serial_number", "stop_pgn_n", "socket_group"):
         assert key in text
+
+
+def test_version_1_told_a_limit_in_several_places_and_the_narrowest_counts() -> None:
+    text, changes = migrate_text(
+        """# the yard
+[gate]
+rotation_max_deg = 45.0  # the fender
+rotation_speed_deg_per_s = 20.0
+lift_max_mm = 200.0
+rotation_min_height_mm = 10.0
+
+[rotation]
+max_deg = 70.0
+velocity_deg_per_s = 15.0
+acceleration_deg_per_s2 = 40.0
+
+[lift_right]
+max_mm = 180.0
+
+[control]
+rotation_max_age_s = 0.3
+actuator_tolerance_mm = 2.0
+"""
+    )
+    config = parse(tomllib.loads(text))
+    figures = config.figures()
+    assert (figures["rotation"].high, figures["rotation"].speed, figures["rotation"].acceleration) == (45.0, 15.0, 40.0)
+    assert (figures["lift_left"].high, figures["lift_right"].high) == (200.0, 180.0)
+    assert figures["rotation"].max_age_s == 0.3
+    assert {figures[axis].tolerance for axis in ACTUATORS} == {2.0}
+    assert config.gate.rotation_min_height_mm == 10.0
+    assert text.startswith("# the yard")
+    assert "[control]" not in text
+    assert any("gate.rotation_max_deg and rotation.max_deg: now rotation.max_deg = 45" in change for change in changes)
+
+
+def test_a_limit_that_the_gates_default_narrowed_stays_narrow() -> None:
+    text, _ = migrate_text("version = 1\n[rotation]\nmin_deg = -80.0\n")
+    assert parse(tomllib.loads(text)).figures()["rotation"].low == -60.0
+    assert migrate_text("[rotation]\nmin_deg = -80.0\n") == ("[rotation]\nmin_deg = -80.0\n", [])

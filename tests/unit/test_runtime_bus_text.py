@@ -7,6 +7,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
+from graderd.config import Config
 from graderd.runtime.port import BUS_LINES_N, Port
 
 
@@ -28,8 +29,8 @@ class Bus:
 
 async def test_lines_come_bundled_and_a_slow_reader_is_told_what_it_lost() -> None:
     bus = Bus()
-    loop = cast("Any", SimpleNamespace(devices=SimpleNamespace(watch_bus=bus.watch)))
-    texts = Port(loop, cast("Any", None), {}).bus_text()
+    devices = SimpleNamespace(watch_bus=bus.watch)
+    texts = Port(Config(), cast("Any", None), cast("Any", devices), cast("Any", None), {}).bus_text()
 
     first = asyncio.create_task(anext(texts), name="first")
     await asyncio.sleep(0)

@@ -52,7 +52,7 @@ async def test_it_arms_turns_and_disarms(tmp_path: Path) -> None:
         assert machine.rotation.position == pytest.approx(5.0)
         assert len(seen) > 10
         assert seen == sorted(seen)
-        assert loop.state.mode is Mode.DISARMED
+        assert loop.tick.state.mode is Mode.DISARMED
 
 
 async def test_stop_ends_it_under_way(tmp_path: Path) -> None:
@@ -65,14 +65,14 @@ async def test_stop_ends_it_under_way(tmp_path: Path) -> None:
         with pytest.raises(DeviceLostError, match="person near the blade"):
             async with Maneuver(loop) as blade:
                 await blade.rotate_to(40.0, 30.0, step_in)
-        assert loop.state.mode is Mode.STOPPED
+        assert loop.tick.state.mode is Mode.STOPPED
 
 
 async def test_it_refuses_what_an_operator_would_be_refused(tmp_path: Path) -> None:
     async with running(tmp_path) as (machine, loop):
         with pytest.raises(DeviceRefusedError, match=r"90\.0 deg"):
             await turn(loop, 90.0)
-        assert loop.state.mode is Mode.DISARMED
+        assert loop.tick.state.mode is Mode.DISARMED
         machine.tilt.lifecycle = Lifecycle.FAILED
         with pytest.raises(DeviceRefusedError, match="tilt"):
             await turn(loop, 5.0)

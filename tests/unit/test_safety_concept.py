@@ -46,5 +46,5 @@ def test_every_function_is_named_by_a_hazard_and_has_a_proof() -> None:
 
 def test_braking_is_what_the_settings_give() -> None:
     config = Config()
-    speed, braking = config.gate.rotation_speed_deg_per_s, config.rotation.acceleration_deg_per_s2
+    speed, braking = config.rotation.speed_deg_per_s, config.rotation.profile_acceleration_deg_per_s2
     assert f"{speed / braking:.2f} s and {speed**2 / braking / 2:.1f}° from" in PAGE

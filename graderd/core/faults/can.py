@@ -1,8 +1,9 @@
 """Faults of the CAN bus. While the bus is lost no actuator can be told to stop: DISARM; a disturbed bus is told."""
 
+from graderd.core.axes import ACTUATORS, PARTS
 from graderd.core.faults.monitor import Clear, FaultRow, Reaction
 
-ACTUATORS = frozenset({"lift", "tilt"})
+BOTH_KINDS = frozenset(PARTS[name] for name in ACTUATORS)
 
 ROWS = (
     FaultRow(
@@ -63,7 +64,7 @@ ROWS = (
         "two devices with equal NAMEs, or a faulty one",
         "give one of them another NAME or address",
         Reaction.HOLD,
-        axes=ACTUATORS,
+        axes=BOTH_KINDS,
     ),
     FaultRow(
         "can.flood",

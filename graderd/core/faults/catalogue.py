@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
+from graderd.core.axes import ACTUATORS
 from graderd.core.faults import actuator, camera, can, daemon, rotation, stop_input
-from graderd.core.faults.monitor import ACTUATORS, FaultRow, catalogue_key
+from graderd.core.faults.monitor import FaultRow, catalogue_key
 
 
 def _by_key(rows: Iterable[FaultRow]) -> Mapping[str, FaultRow]:

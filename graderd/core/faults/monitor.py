@@ -6,10 +6,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 
+from graderd.core.axes import ACTUATORS, PARTS
 from graderd.hal.fault import DeviceFault
 
-ACTUATORS = ("lift_left", "lift_right", "tilt")
-ALL_AXES = frozenset({"rotation", "lift", "tilt"})
+ALL_AXES = frozenset(PARTS.values())
 
 
 class Reaction(IntEnum):
@@ -139,6 +139,5 @@ def worst(active: Iterable[ActiveFault]) -> ActiveFault | None:
 def _axes_of(device: str, row: FaultRow) -> FaultRow:
     """The lift rows hold both lifts; a fault of the tilt holds the tilt alone, unless the row says otherwise."""
     if row.key.startswith("actuator.") and row.axes == frozenset({"own"}):
-        own = frozenset({"tilt"}) if device == "tilt" else frozenset({"lift"})
-        return replace(row, axes=own)
+        return replace(row, axes=frozenset({PARTS[device]}))
     return row

@@ -96,13 +96,15 @@ class Daemon:
         self._loop = ControlLoop(config, self._devices, self._eyes, clock, StateFile(config.state.directory))
         rotator = self._devices.rotation
         assert isinstance(rotator, Ph54Rotator)  # build_devices made it
-        self._port = Port(self._loop, self._eyes, build_services(config, rotator, self._loop, self._eyes))
+        self._port = Port(
+            config, self._loop, self._devices, self._eyes, build_services(config, rotator, self._loop, self._eyes)
+        )
         self._recorder = Recorder(config)
         self._health = HealthWatch(config)
-        self._loop.extra_faults += [AdapterWatch(rotator).faults, self._recorder.faults, self._health.faults]
+        self._loop.fault_sources += [AdapterWatch(rotator).faults, self._recorder.faults, self._health.faults]
         self._stop_input = build_stop_input(config, clock, on_stop=self._stop_from_input)
         if self._stop_input is not None:
-            self._loop.extra_faults.append(self._stop_input.faults)
+            self._loop.fault_sources.append(self._stop_input.faults)
         self._loop.on_tick = self._after_tick
         self._status_line_due_s = 0.0
         self._ended = asyncio.Event()
@@ -117,11 +119,12 @@ class Daemon:
         """Runs in the tick: nothing here may wait."""
         self._notifier.feed_watchdog()
         self._port.published()
-        self._recorder.take(self._loop.time_s, self._port.status)
-        self._devices.publish_faults(self._loop.published_faults(), self._loop.state.mode is Mode.STOPPED)
-        if self._loop.time_s >= self._status_line_due_s:
-            self._status_line_due_s = self._loop.time_s + STATUS_LINE_S
-            self._notifier.status(f"{self._loop.state.mode}: {self._loop.state.reason}")
+        tick = self._loop.tick
+        self._recorder.take(tick.now_s, self._port.status)
+        self._devices.publish_faults(tick.device_faults(), tick.state.mode is Mode.STOPPED)
+        if tick.now_s >= self._status_line_due_s:
+            self._status_line_due_s = tick.now_s + STATUS_LINE_S
+            self._notifier.status(f"{tick.state.mode}: {tick.state.reason}")
 
     async def run(self) -> None:
         """Run until a signal, then stop motion, close the devices in the configured order, and return."""
@@ -137,9 +140,7 @@ class Daemon:
                 tasks = [
                     group.create_task(self._loop.run(), name="control-tick"),
                     group.create_task(self._eyes.run(), name="perception"),
-                    group.create_task(
-                        open_devices(self._loop.devices, self._loop.connection_problems), name="open-devices"
-                    ),
+                    group.create_task(open_devices(self._devices), name="open-devices"),
                     group.create_task(self._health.run(), name="health"),
                     group.create_task(self._recorder.run(), name="recorder"),
                 ]

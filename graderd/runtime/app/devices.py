@@ -13,7 +13,7 @@ from graderd.drivers.stop_input import make_stop_input
 from graderd.hal.clock import Clock
 from graderd.hal.fault import DeviceFault
 from graderd.hal.linear_actuator import LinearActuator
-from graderd.runtime.devices import ACTUATOR_NAMES, Devices
+from graderd.runtime.devices import Devices
 from graderd.runtime.stop_input import StopInputWatch
 
 
@@ -22,7 +22,7 @@ def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], Non
     rotator = Ph54Rotator(config.rotation, clock)
     link = CanLink(config.can, clock, on_stop=on_bus_stop)
     actuators: dict[str, LinearActuator] = {
-        name: ElectrakActuator(name, getattr(config, name), link, clock) for name in ACTUATOR_NAMES
+        name: ElectrakActuator(name, section, link, clock) for name, section in config.actuators().items()
     }
 
     def publish(faults: tuple[DeviceFault, ...], stopped: bool) -> None:

@@ -63,7 +63,7 @@ def build_services(
 
     async def calibrate(arguments: dict[str, Any]) -> dict[str, Any]:
         wanted = _checked(CalibrateArguments, arguments)
-        return await _collect_frames(loop, eyes, wanted)
+        return await _collect_frames(config, loop, eyes, wanted)
 
     return {
         "rotation.verify_profile": verify_profile,
@@ -80,10 +80,10 @@ async def _step_response(
     """Steps through machine and gate: what is measured is what the blade does in operation."""
     samples: list[StepSample] = []
     async with Maneuver(loop) as blade:
-        start_deg = loop.pose(loop.time_s).rotation_deg
+        start_deg = loop.tick.pose.rotation_deg
         if start_deg is None:
             raise DeviceMissingError("rotation", "no fresh measurement to start from")
-        began_s = loop.time_s
+        began_s = loop.tick.now_s
 
         def sample(goal_deg: float) -> None:
             told = rotator.telemetry()
@@ -101,16 +101,16 @@ async def _step_response(
         for share in (0.0, *STEP_SHARES):
             goal_deg = start_deg + share * wanted.step_deg
             await blade.rotate_to(goal_deg, wanted.dwell_s, partial(sample, goal_deg))
-    gate = config.gate
+    rotation = config.rotation
     settings = {
-        "gate speed": f"{gate.rotation_speed_deg_per_s:g} deg/s",
-        "gate acceleration": f"{gate.rotation_acceleration_deg_per_s2:g} deg/s²",
-        "profile velocity": f"{config.rotation.velocity_deg_per_s:g} deg/s",
-        "profile acceleration": f"{config.rotation.acceleration_deg_per_s2:g} deg/s²",
-        "current limit": f"{config.rotation.current_limit_a:g} A",
+        "goal's speed": f"{rotation.speed_deg_per_s:g} deg/s",
+        "goal's acceleration": f"{rotation.acceleration_deg_per_s2:g} deg/s²",
+        "profile velocity": f"{rotation.profile_velocity_deg_per_s:g} deg/s",
+        "profile acceleration": f"{rotation.profile_acceleration_deg_per_s2:g} deg/s²",
+        "current limit": f"{rotation.current_limit_a:g} A",
         "simulated": "yes" if config.simulated else "no",
     }
-    recording = analyse(samples, config.rotation.in_position_deg, settings)
+    recording = analyse(samples, rotation.tolerance_deg, settings)
     return {
         "steps": [asdict(step) for step in recording.steps],
         "backlash_deg": recording.backlash_deg,
@@ -120,9 +120,11 @@ async def _step_response(
     }
 
 
-async def _collect_frames(loop: ControlLoop, eyes: PerceptionSupervisor, wanted: CalibrateArguments) -> dict[str, Any]:
+async def _collect_frames(
+    config: Config, loop: ControlLoop, eyes: PerceptionSupervisor, wanted: CalibrateArguments
+) -> dict[str, Any]:
     """Turn the empty blade to each angle and save one frame there, as a frame set."""
-    limits = loop.config.gate.limits()["rotation"]
+    limits = config.figures()["rotation"]
     for angle_deg in wanted.angles_deg:
         if not limits.low <= angle_deg <= limits.high:
             raise CommandRangeError("angles_deg", f"{angle_deg:g} is outside {limits.low:g} to {limits.high:g} deg")
@@ -133,7 +135,7 @@ async def _collect_frames(loop: ControlLoop, eyes: PerceptionSupervisor, wanted:
     async with Maneuver(loop) as blade:
         for number, angle_deg in enumerate(wanted.angles_deg):
             await blade.rotate_to(angle_deg, dwell_s)
-            measured_deg = loop.pose(loop.time_s).rotation_deg
+            measured_deg = loop.tick.pose.rotation_deg
             if measured_deg is None:
                 raise DeviceMissingError("rotation", "no fresh measurement while calibrating")
             await eyes.save_frame(folder, f"{number:03d}", measured_deg)

@@ -1,0 +1,243 @@
+"""The tick as data: what it knows goes in as one value, what it decided comes out as one, and nobody asks twice.
+
+``golden/tick.json`` is a recorded stretch of work, as ``Sensed`` was, with what ``Tick`` said then. After a change that
+is meant: ``python -m tests.unit.test_core_tick`` writes it anew; read the difference before you commit it.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import math
+from collections import Counter
+from dataclasses import asdict, is_dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import TypeAdapter
+
+import graderd
+from graderd.config import Config
+from graderd.core import commands as cmd
+from graderd.core import readiness
+from graderd.core.axes import ACTUATORS, AXES
+from graderd.core.machine import Mode
+from graderd.core.soil import SoilObservation, Zone
+from graderd.core.tick import AxisSensed, Controller, Sensed, Tick
+from graderd.hal.fault import DeviceFault
+from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.linear_actuator import ActuatorTelemetry
+from graderd.hal.reading import Reading
+from graderd.hal.rotator import RotatorTelemetry
+from graderd.runtime.control import ControlLoop, tick_settings
+from graderd.runtime.state_file import StateFile
+from tests.fakes import FakeMachine
+
+GOLDEN = Path(__file__).parent / "golden" / "tick.json"
+RECORDED = TypeAdapter(list[Sensed])
+TICK_S = 0.02
+KEPT_EVERY_N = 3
+"""Of the ticks, in the file: each holds what all before it led to."""
+SETTINGS = tick_settings(Config())
+
+
+def standing(
+    now_s: float,
+    at: dict[str, float],
+    lifecycle: Lifecycle = Lifecycle.ACTIVE,
+    goals: dict[str, float] | None = None,
+) -> dict[str, AxisSensed]:
+    """Every axis measured this moment; ``goals``: where their devices are driving them to."""
+    goals = goals or {}
+    turned = RotatorTelemetry(angle_deg=Reading(at["rotation"], now_s), goal_deg=goals.get("rotation"))
+    return {
+        "rotation": AxisSensed(lifecycle, turned),
+        **{
+            axis: AxisSensed(
+                lifecycle, ActuatorTelemetry(position_mm=Reading(at[axis], now_s), goal_mm=goals.get(axis))
+            )
+            for axis in ACTUATORS
+        },
+    }
+
+
+HOME = {"rotation": 0.0, "lift_left": 100.0, "lift_right": 100.0, "tilt": 50.0}
+
+
+def stretch_of_work() -> list[Sensed]:
+    """Arm, jog, preset, automatic with soil on the left, fault, late tick, stop, reset: on a machine that follows."""
+    controller, found, at, powered = Controller(SETTINGS), [], dict(HOME), False
+    goals: dict[str, float] = {}
+    commands: dict[int, tuple[cmd.AnyCommand, ...]] = {
+        5: (cmd.Arm(client="a"),),
+        10: (cmd.Jog(axis="rotate", value=6.0, client="a"),),
+        12: (cmd.Renew(client="a"),),
+        20: (cmd.Renew(client="a"), cmd.Jog(axis="height", value=10.0, client="b")),
+        60: (cmd.Preset(name="transport", client="a"),),
+        70: (cmd.Renew(client="a"),),
+        90: (cmd.Auto(client="a"),),
+        260: (cmd.Stop(reason="enough", client="b"), cmd.Reset(client="a")),
+        270: (cmd.Reset(client="a"),),
+    }
+    for number in range(300):
+        now_s = 100.0 + TICK_S * number
+        seen = SoilObservation(now_s - 0.03, Zone.LEFT, 0.9, "", 0.8, 0.15, 0.05, frame_number=number)
+        sensed = Sensed(
+            now_s,
+            standing(now_s, at, Lifecycle.ACTIVE if powered else Lifecycle.STANDBY, goals),
+            faults=(DeviceFault("lift_left", "no_feedback", "0.4 s", now_s),) if 200 <= number < 210 else (),
+            commands=commands.get(number, ()),
+            observation=seen if number > 95 and number % 2 else None,
+            powered=powered,
+            refused={"rotation": "soft limit"} if number == 150 else {},
+            late_s=0.15 if number == 180 else 0.0,
+        )
+        tick = controller.step(sensed)
+        powered = tick.intents.power
+        goals = {
+            axis: decided.send if decided.send is not None else goals[axis]
+            for axis, decided in tick.axes.items()
+            if decided.send is not None or (axis in goals and not decided.hold)
+        }
+        at |= goals
+        found.append(sensed)
+    return found
+
+
+def told(tick: Tick) -> Any:
+    """A tick as JSON has it, its numbers rounded so that no platform's last bit matters."""
+    return _plain(
+        {
+            "mode": tick.state.mode,
+            "reason": tick.state.reason,
+            "pose": tick.pose,
+            "attitude": tick.attitude,
+            "faults": [(f.name, f.present, f.since_s) for f in tick.faults],
+            "unmet": [r.name for r in tick.readiness if not r.met],
+            "axes": dict(tick.axes),
+            "replies": [reply.model_dump() for reply in tick.replies],
+            "stopped_now": tick.stopped_now,
+            "soil": None if tick.soil is None else [tick.soil.zone, tick.soil.frame_number],
+            "overruns_n": tick.overruns_n,
+        }
+    )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return round(value, 9) if math.isfinite(value) else str(value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return _plain(asdict(value))
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def run(recorded: list[Sensed]) -> list[Tick]:
+    controller = Controller(SETTINGS)
+    return [controller.step(sensed) for sensed in recorded]
+
+
+def test_a_recorded_list_of_sensed_gives_the_recorded_list_of_ticks() -> None:
+    golden = json.loads(GOLDEN.read_text(encoding="utf-8"))
+    ticks = [told(tick) for tick in run(RECORDED.validate_python(golden["sensed"]))[::KEPT_EVERY_N]]
+    assert len(ticks) == len(golden["ticks"]) == 100
+    for number, (now, then) in enumerate(zip(ticks, golden["ticks"], strict=True)):
+        assert now == then, f"tick {number * KEPT_EVERY_N}"
+
+
+def test_the_recorded_stretch_has_everything_in_it() -> None:
+    ticks = run(stretch_of_work())
+    assert {tick.state.mode for tick in ticks} == set(Mode)
+    assert {fault.name for tick in ticks for fault in tick.faults} >= {"lift_left.no_feedback", "daemon.tick_overrun"}
+    assert max(tick.axes["rotation"].limited or 0.0 for tick in ticks) == pytest.approx(30.0, abs=25.0)
+    assert any(decided.arrived for tick in ticks for decided in tick.axes.values())
+    assert any("soft limit" in tick.axes["rotation"].because for tick in ticks)
+
+
+def test_writing_sensed_down_and_reading_it_loses_nothing() -> None:
+    recorded = stretch_of_work()
+    again = RECORDED.validate_json(RECORDED.dump_json(recorded))
+    assert again == recorded
+    assert [told(tick) for tick in run(again)] == [told(tick) for tick in run(recorded)]
+
+
+def test_replies_come_in_the_order_of_the_commands() -> None:
+    commands = (cmd.Arm(client="a"), cmd.Stop(client="b"), cmd.Reset(client="a"))
+    tick = Controller(SETTINGS).step(Sensed(1.0, standing(1.0, HOME), commands=commands))
+    assert [reply.command for reply in tick.replies] == ["arm", "stop", "reset"]
+    assert tick.stopped_now
+
+
+def test_a_held_axis_has_not_arrived() -> None:
+    controller, at = Controller(SETTINGS), HOME
+    step = partial(Sensed, powered=True)
+    controller.step(Sensed(1.0, standing(1.0, at, Lifecycle.STANDBY), commands=(cmd.Arm(),)))
+    controller.step(step(1.02, standing(1.02, at)))
+    controller.step(step(1.04, standing(1.04, at), commands=(cmd.Jog(axis="rotate", value=2.0),)))
+    tick = controller.step(step(1.06, standing(1.06, at | {"rotation": 2.0}, goals={"rotation": 2.0})))
+    assert tick.axes["rotation"].arrived
+    low = DeviceFault("rotation", "voltage_low", "18 V", 1.0)
+    for number in range(200):
+        now_s = 1.08 + TICK_S * number
+        tick = controller.step(step(now_s, standing(now_s, at), faults=(low,), commands=(cmd.Renew(),)))
+    assert not tick.axes["rotation"].arrived
+
+
+async def test_each_device_is_asked_once_a_tick_and_readiness_is_made_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine, asked = FakeMachine(), Counter[str]()
+    loop = ControlLoop(Config(), machine.devices, machine.eyes, machine.clock, StateFile(str(tmp_path)))
+
+    def count(name: str, call: Any) -> Any:
+        def counted(*arguments: Any) -> Any:
+            asked[name] += 1
+            return call(*arguments)
+
+        return counted
+
+    for name, device in machine.devices.all().items():
+        monkeypatch.setattr(device, "telemetry", count(name, device.telemetry))
+    monkeypatch.setattr("graderd.core.tick.requirements", count("requirements", readiness.requirements))
+    loop.turn()
+    assert asked == Counter({**dict.fromkeys(AXES, 1), "requirements": 1})
+    await loop._power.close()
+
+
+def test_nobody_but_the_tick_calls_what_it_decides_with() -> None:
+    deciding = {
+        "step",
+        "pass_gate",
+        "update_faults",
+        "clear_faults",
+        "LiftCoordinator",
+        "requirements",
+        "decide",
+        "resolve",
+    }
+    root = Path(graderd.__file__).parent
+    importers = Counter[str]()
+    for path in root.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("graderd.core."):
+                taken = deciding & {alias.name for alias in node.names}
+                if taken - ({"decide"} if path.name == "machine.py" else set()):
+                    importers[path.relative_to(root).as_posix()] += 1
+    assert set(importers) == {"core/tick.py"}
+
+
+def main() -> None:
+    """Write the golden file anew."""
+    recorded = stretch_of_work()
+    golden = {
+        "sensed": RECORDED.dump_python(recorded, mode="json"),
+        "ticks": [told(t) for t in run(recorded)[::KEPT_EVERY_N]],
+    }
+    GOLDEN.write_text(json.dumps(golden, separators=(",", ":")) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
