@@ -75,10 +75,19 @@ def _build(place: Path, scratch: Path, package: Path, suite: str) -> None:
 
 
 def _add_kernel(root: Path, scratch: Path) -> str:
-    """Fetch the archive's newest kernel, put the modules we use into the root; its release."""
+    """Fetch the archive's newest kernel, put the modules we use into the root; its release.
+
+    Raises:
+        SystemExit: it cannot be had, or has not all of the modules.
+    """
     newest = "apt-cache depends linux-image-amd64 | sed -n 's/.*Depends: //p' | head -n 1"
     command = ["chroot", str(root), "/bin/sh", "-c", f"cd /tmp && apt-get download -q $({newest})"]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(
+            f"hil: no kernel from the archive: {done.stderr.strip()[-500:]}. See `apt-cache policy linux-image-amd64`; "
+            "where the mirror is at fault, run it again"
+        )
     archive = next((root / "tmp").glob("linux-image-*.deb"))
     subprocess.run(["dpkg-deb", "-x", archive, scratch / "kernel"], check=True)
     archive.unlink()
@@ -96,10 +105,19 @@ def _add_kernel(root: Path, scratch: Path) -> str:
 
 
 def _with_dependencies(base: Path, release: str, names: Sequence[str]) -> list[Path]:
-    """The files of these modules, each after those it needs, none twice."""
+    """The files of these modules, each after those it needs, none twice.
+
+    Raises:
+        SystemExit: this kernel has not all of them.
+    """
     command = ["modprobe", "--all", "--show-depends", "--dirname", str(base), "--set-version", release, *names]
-    listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    found = [Path(line.split()[1]) for line in listed.splitlines() if line.startswith("insmod")]
+    listed = subprocess.run(command, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        raise SystemExit(
+            f"hil: Linux {release} of the archive: {listed.stderr.strip()}. Modules were renamed or built in since: "
+            "correct TO_BOOT and TO_USE in hil/qemu.py"
+        )
+    found = [Path(line.split()[1]) for line in listed.stdout.splitlines() if line.startswith("insmod")]
     return list(dict.fromkeys(found))
 
 

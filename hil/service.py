@@ -138,7 +138,9 @@ class Api:
         return found
 
     def command(self, name: str, **arguments: object) -> Any:
-        """One command."""
+        """One command; a reset names the stop that is latched now."""
+        if name == "reset":
+            arguments = {"stop_n": self.request("GET", "/v1/status")["stop_n"], **arguments}
         return self.request("POST", "/v1/commands", {"command": name, "client": "hil", **arguments})
 
     def stop(self) -> Any:

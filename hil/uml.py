@@ -104,7 +104,7 @@ class Guest:
     def command_line(self, scratch: Path) -> list[str]:
         """What starts the guest; files it needs are made in ``scratch``."""
         # A kernel of our own has everything built in.
-        modules = list(MODULES.glob("*/kernel/fs/overlayfs/overlay.ko"))[:1] if self.kernel == KERNEL else []
+        modules = [overlay_module()] if self.kernel == KERNEL else []
         return [
             str(self.kernel),
             f"mem={self.memory_mib}M",
@@ -143,12 +143,17 @@ def end_in_order() -> None:
         signal.signal(number, end)
 
 
+def overlay_module() -> Path:
+    """The module that makes the guest's root, of the installed kernel's own release: others may lie beside it."""
+    asked = subprocess.run([KERNEL, "--version"], capture_output=True, text=True, check=True)
+    return MODULES / asked.stdout.strip() / "kernel/fs/overlayfs/overlay.ko"
+
+
 def missing() -> list[str]:
     """What the launcher needs and this machine has not, as paths."""
-    found = [KERNEL, BUSYBOX]
-    absent = [str(path) for path in found if not path.exists()]
-    if not any(MODULES.glob("*/kernel/fs/overlayfs/overlay.ko")):
-        absent.append(f"{MODULES}/*/kernel/fs/overlayfs/overlay.ko")
+    absent = [str(path) for path in (KERNEL, BUSYBOX) if not path.exists()]
+    if KERNEL.exists() and not overlay_module().exists():
+        absent.append(str(overlay_module()))
     if shutil.which("cpio") is None:
         absent.append("cpio")
     return absent

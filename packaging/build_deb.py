@@ -5,16 +5,17 @@ the system's python3: ``lib/common`` holds what every Python takes, ``lib/python
 packages of each supported Python. So one package serves Debian 12 (3.11), Ubuntu 24.04 (3.12) and Debian 13 (3.13).
 Nothing is compiled: every dependency comes as a wheel named in requirements.lock with its hash, which is also why an
 arm64 package can be built on any machine.
+
+The package is a function of the sources: two builds of a commit are the same file, whoever makes them, where and when.
+Its time stamps are $SOURCE_DATE_EPOCH, or the commit's.
 """
 
 from __future__ import annotations
 
 import argparse
-import compileall
 import gzip
 import hashlib
 import os
-import py_compile
 import shutil
 import subprocess
 import sys
@@ -24,9 +25,11 @@ import zipfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 from lock import Pin, Target, read_lock, roots, select
+from notices import copyright_file
 from packaging.utils import canonicalize_name
 
 PROJECT = Path(__file__).resolve().parent.parent
@@ -38,6 +41,8 @@ PREFIX = Path("opt/graderd")
 
 # Folders of dependencies that serve only their own development.
 NOT_SHIPPED = {"tests", "_pyinstaller", "__pyinstaller", "include"}
+# And files: debugging symbols that were split off.
+NOT_SHIPPED_SUFFIX = ".debug"
 
 # Where our own files go: source in the project, place in the package, mode.
 FILES = (
@@ -49,6 +54,7 @@ FILES = (
     ("systemd/udev/70-graderd.rules", "usr/lib/udev/rules.d/70-graderd.rules", 0o644),
     ("systemd/can-link", "usr/lib/graderd/can-link", 0o755),
     ("systemd/adapter-name", "usr/lib/graderd/adapter-name", 0o755),
+    ("packaging/bytecode", "usr/lib/graderd/bytecode", 0o755),
     ("systemd/graderd.env", "usr/share/graderd/default", 0o644),
     ("systemd/adapters", "usr/share/graderd/adapters", 0o644),
     ("systemd/network/70-graderd-can.link", "usr/share/graderd/network/70-graderd-can.link", 0o644),
@@ -57,8 +63,14 @@ FILES = (
     ("systemd/dropins/web-page.conf", "usr/share/graderd/dropins/web-page.conf", 0o644),
     ("systemd/dropins/gpio.conf", "usr/share/graderd/dropins/gpio.conf", 0o644),
     ("systemd/dropins/bind-devices.conf", "usr/share/graderd/dropins/bind-devices.conf", 0o644),
-    ("LICENSE", "usr/share/doc/graderd/copyright", 0o644),
+    ("packaging/debian/lintian-overrides", "usr/share/lintian/overrides/graderd", 0o644),
 )
+
+# How dpkg-deb packs: as any dpkg reads it; or, for tests on this machine, in a tenth of the time and a sixth larger.
+# Higher levels take twice as long and more for a package that is a fourteenth smaller. One thread: into how many pieces
+# several cut the package must not be the machine's affair.
+PACKED = ("-Zxz", "-z1", "--threads-max=1")
+PACKED_FAST = ("-Zzstd", "-z3", "--threads-max=1")
 
 LAUNCHER = """\
 #!/opt/graderd/bin/python -I
@@ -95,6 +107,26 @@ def run(*command: str | Path, cwd: Path = PROJECT) -> None:
     result = subprocess.run([str(part) for part in command], cwd=cwd, capture_output=True, text=True, check=False)
     if result.returncode:
         raise SystemExit(f"build_deb: {' '.join(map(str, command[:6]))}… failed:\n{result.stdout}{result.stderr}")
+
+
+def commit_time_s() -> int:
+    """$SOURCE_DATE_EPOCH, else when the commit was made, in seconds since 1970.
+
+    Raises:
+        SystemExit: neither is known.
+    """
+    said = os.environ.get("SOURCE_DATE_EPOCH")
+    if not said:
+        asked = subprocess.run(
+            ["git", "log", "-1", "--format=%ct"], cwd=PROJECT, capture_output=True, text=True, check=False
+        )
+        said = asked.stdout.strip()
+    if not said.isascii() or not said.isdigit():
+        raise SystemExit(
+            f"build_deb: the time of the package's files is {said!r}, not seconds since 1970. Build in a git checkout, "
+            "or set SOURCE_DATE_EPOCH"
+        )
+    return int(said)
 
 
 def pip(*arguments: str | Path) -> None:
@@ -185,6 +217,8 @@ def unpack(wheel: Path, folder: Path) -> None:
                 if kind not in ("purelib", "platlib") or not rest:
                     continue
                 member.filename = rest
+            if member.filename.endswith(NOT_SHIPPED_SUFFIX):
+                continue
             if not NOT_SHIPPED.intersection(Path(member.filename).parts[1:-1]):
                 archive.extract(member, folder)
 
@@ -217,22 +251,6 @@ def make_environment(package: Package, wheels: dict[str, list[Path]], own: Path)
         launcher = package.prefix / "bin" / name
         launcher.write_text(LAUNCHER.format(module=module, function=function), encoding="utf-8")
         launcher.chmod(0o755)
-
-
-def compile_bytecode(package: Package) -> None:
-    """Byte code for the Python this runs on (the others' is made when the package is configured)."""
-    own = f"{sys.version_info.major}.{sys.version_info.minor}"
-    for folder in ("common", f"python{own}"):
-        path = package.prefix / "lib" / folder
-        if path.exists():
-            compileall.compile_dir(
-                path,
-                quiet=2,
-                workers=0,
-                stripdir=str(package.tree),
-                prependdir="/",
-                invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH,
-            )
 
 
 def place_files(package: Package) -> None:
@@ -295,14 +313,21 @@ def write_control(package: Package) -> None:
         )
     )
     (folder / "control").write_text(control, encoding="utf-8")
-    for name in ("postinst", "prerm", "postrm"):
+    for name, mode in (("postinst", 0o755), ("prerm", 0o755), ("postrm", 0o755), ("triggers", 0o644)):
         shutil.copyfile(DEBIAN / name, folder / name)
-        (folder / name).chmod(0o755)
+        (folder / name).chmod(mode)
     sums = [
         f"{hashlib.md5(path.read_bytes(), usedforsecurity=False).hexdigest()}  {path.relative_to(package.tree)}\n"
         for path in sorted(files)
     ]
     (folder / "md5sums").write_text("".join(sums), encoding="utf-8")
+
+
+def level(tree: Path) -> None:
+    """Give every file the same time, whenever it was written."""
+    time_s = int(os.environ["SOURCE_DATE_EPOCH"])
+    for path in [tree, *tree.rglob("*")]:
+        os.utime(path, (time_s, time_s), follow_symlinks=False)
 
 
 def system_python() -> str:
@@ -318,25 +343,37 @@ def system_python() -> str:
     return own
 
 
-def build(version: str, architecture: str, pythons: tuple[str, ...], folder: Path) -> Path:
-    """Build the package into ``folder``; returns its path."""
+def build(version: str, architecture: str, pythons: tuple[str, ...], folder: Path, packing: Sequence[str]) -> Path:
+    """Build the package into ``folder``, packed as these options of dpkg-deb say; returns its path."""
     folder.mkdir(parents=True, exist_ok=True)
+    if find_spec("pip") is None:
+        # An environment that uv made has none; Python itself brings one.
+        run(sys.executable, "-m", "ensurepip")
     with tempfile.TemporaryDirectory(prefix="graderd-deb-") as temporary:
         scratch = Path(temporary)
         package = Package(version, architecture, pythons, scratch / "tree")
         package.tree.mkdir(mode=0o755)
         os.umask(0o022)
+        # dpkg-deb writes a time of its own, and takes it from here.
+        os.environ["SOURCE_DATE_EPOCH"] = str(commit_time_s())
         with ThreadPoolExecutor(thread_name_prefix="beside the download") as pool:
             own = pool.submit(our_wheel, package, scratch)
             placed = pool.submit(place_files, package)
-            make_environment(package, wheels_for(package, scratch), own.result())
+            wheels = wheels_for(package, scratch)
+            make_environment(package, wheels, own.result())
             placed.result()
-        compile_bytecode(package)
+        place_of = {
+            wheel: str(PREFIX / "lib" / ("common" if serves_all(wheel, python) else f"python{python}/site-packages"))
+            for python, files in wheels.items()
+            for wheel in files
+        }
+        notices = package.tree / "usr/share/doc/graderd/copyright"
+        notices.write_text(copyright_file(wheels, place_of), encoding="utf-8")
         run("chmod", "-R", "u+rwX,go+rX,go-w", package.tree)
         write_control(package)
+        level(package.tree)
         result = folder / f"graderd_{version}_{architecture}.deb"
-        # Level 10 takes eight times as long for a file that is a tenth smaller.
-        run("dpkg-deb", "--root-owner-group", "-Zzstd", "-z3", "--build", package.tree, result)
+        run("dpkg-deb", "--root-owner-group", *packing, "--build", package.tree, result)
     return result
 
 
@@ -351,7 +388,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--system-python", action="store_true", help="for this machine's Python only, for tests on it")
     options = parser.parse_args(arguments)
     pythons = (system_python(),) if options.system_python else PYTHONS
-    result = build(options.version, options.arch, pythons, options.out)
+    packing = PACKED_FAST if options.system_python else PACKED
+    result = build(options.version, options.arch, pythons, options.out, packing)
     sys.stdout.write(f"{result} ({result.stat().st_size / 1e6:.0f} MB)\n")
     return 0
 

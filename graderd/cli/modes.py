@@ -67,8 +67,12 @@ def register(app: typer.Typer) -> None:
 
     @app.command(epilog=example("graderd reset && graderd arm"))
     def reset(context: typer.Context, json: Json = False) -> None:
-        """Leave the latched stop for disarmed."""
-        _send(context, "reset", json)
+        """Leave the latched stop for disarmed.
+
+        It clears the stop that is latched when the command starts, and none that comes meanwhile.
+        """
+        daemon = daemon_of(context)
+        _tell(daemon.command("reset", stop_n=daemon.get("/v1/status")["stop_n"]), json)
 
     @app.command(epilog=example("graderd auto"))
     def auto(context: typer.Context, json: Json = False) -> None:

@@ -35,9 +35,10 @@ class Stop(_Command):
 
 
 class Reset(_Command):
-    """Leave the latched stop for disarmed."""
+    """Leave the latched stop for disarmed. It clears the stop it names and none that came after it."""
 
     command: Literal["reset"] = "reset"
+    stop_n: int = Field(ge=0, description="number of the stop that is cleared, as status tells it")
 
 
 class Auto(_Command):

@@ -6,7 +6,7 @@ STOPPED (latched; left only by reset, which leads to DISARMED). Nothing moves ou
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -56,10 +56,16 @@ class Lease:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """All memory of the machine."""
+    """All memory of the machine.
+
+    ``stop_n``: how many stops there were, each counted, also those that met a machine already stopped: a reset names
+    the last one it knows of. ``stops``: the reasons of the stop that is latched, the first and the newest after it.
+    """
 
     mode: Mode = Mode.DISARMED
     reason: str = "started disarmed"
+    stop_n: int = 0
+    stops: tuple[str, ...] = ()
     arming_since_s: float | None = None
     goals: Goals = field(default_factory=Goals)
     later: tuple[Goals, ...] = ()
@@ -72,7 +78,9 @@ class State:
 class Inputs:
     """What is known at one tick.
 
-    ``observation``: a new one, not handed in before. ``settled``: every commanded axis is at its goal.
+    ``observation``: a new one, not handed in before. ``settled``: every commanded axis is at its goal, or at the bound
+    the gate lets it have; ``arrived``: at its goal. ``held``: why an axis with a goal was not let move, by axis.
+    All three speak of the goals of the tick before.
     ``devices_active``: all required devices are ACTIVE. ``arm_error``: why arming the devices failed, once.
     ``resolve``: turns a jog or preset into goals in stages, or gives the reason it cannot.
     """
@@ -83,6 +91,8 @@ class Inputs:
     observation: SoilObservation | None = None
     pose: Pose = field(default_factory=Pose)
     settled: bool = True
+    arrived: bool = True
+    held: Mapping[str, str] = field(default_factory=dict)
     devices_active: bool = False
     arm_error: str = ""
     unmet: tuple[Unmet, ...] = ()
@@ -113,7 +123,7 @@ class Step:
 def step(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSettings) -> Step:
     """One tick: faults first, then commands in their order, then automatic operation."""
     before = state
-    state = _react(state, inputs)
+    state = _lapse(_react(state, inputs), inputs.now_s)
     replies: list[cmd.Reply] = []
     stop_asked = any(isinstance(c, cmd.Stop) for c in inputs.commands)
     for command in sorted(inputs.commands, key=lambda c: not isinstance(c, cmd.Stop)):
@@ -124,9 +134,9 @@ def step(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSett
             continue
         state, reply = _obey(state, command, inputs, settings)
         replies.append(reply)
-    # "settled" speaks of the goals of the tick before: goals taken in this tick are not reached yet.
-    settled = inputs.settled and state.goals == before.goals
-    state = _advance(state, replace(inputs, settled=settled), settings, rule)
+    if state.goals != before.goals:  # taken in this tick: not reached yet, and nothing has held them
+        inputs = replace(inputs, settled=False, arrived=False, held={})
+    state = _advance(state, inputs, settings, rule)
     armed = state.mode in ARMED
     return Step(
         state,
@@ -142,19 +152,28 @@ def step(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSett
 def _react(state: State, inputs: Inputs) -> State:
     """The reactions of faults and lost devices; they come before any command."""
     fault = worst(inputs.faults)
-    if fault is not None and fault.row.reaction is Reaction.STOP and state.mode is not Mode.STOPPED:
-        return _stopped(f"{fault.name}: {fault.row.reads}")
+    if fault is not None and fault.row.reaction is Reaction.STOP:
+        why = f"{fault.name}: {fault.row.reads}"
+        known = state.mode is Mode.STOPPED and (why in state.stops or not fault.present)
+        return state if known else _stopped(state, why)
     if state.mode is Mode.STOPPED:
         return state
     if fault is not None and fault.row.reaction >= Reaction.DISARM:
         if state.mode is not Mode.DISARMED or state.arming_since_s is not None:
-            return _disarmed(f"{fault.name}: {fault.row.reads}")
+            return _disarmed(state, f"{fault.name}: {fault.row.reads}")
         return state
     if state.mode in ARMED and not inputs.devices_active:
-        return _disarmed("a device left its active state")
+        return _disarmed(state, "a device left its active state")
     if fault is not None and fault.row.reaction is Reaction.RETREAT and state.mode is Mode.AUTO:
-        return _manual(f"{fault.name}: {fault.row.reads}")
+        return _manual(state, f"{fault.name}: {fault.row.reads}")
     return state
+
+
+def _lapse(state: State, now_s: float) -> State:
+    """A lease that nobody renewed in time is over before any command is heard: a late one renews nothing."""
+    if state.lease is None or now_s <= state.lease.expires_s:
+        return state
+    return _manual(state, f"lease of {state.lease.client or 'the client'} lapsed")
 
 
 def _obey(state: State, command: cmd.Command, inputs: Inputs, settings: MachineSettings) -> tuple[State, cmd.Reply]:
@@ -166,21 +185,22 @@ def _obey(state: State, command: cmd.Command, inputs: Inputs, settings: MachineS
 
     match command:
         case cmd.Stop():
-            if state.mode is Mode.STOPPED:
-                return yes(state, f"already stopped: {state.reason}")
             by = f" (by {command.client})" if command.client else ""
-            return yes(_stopped(command.reason + by), "stopped")
+            stopped = _stopped(state, command.reason + by)
+            return yes(stopped, f"already stopped: {state.reason}" if state.mode is Mode.STOPPED else "stopped")
         case cmd.Disarm():
             if state.mode is Mode.STOPPED:
                 return yes(state, "stopped, and so already without power")
-            return yes(_disarmed("disarm command"), "disarmed")
+            return yes(_disarmed(state, "disarm command"), "disarmed")
         case cmd.Reset():
             if state.mode is not Mode.STOPPED:
                 return yes(state, f"nothing to reset: {state.mode}")
             standing = worst(f for f in inputs.faults if f.present and f.row.reaction is Reaction.STOP)
             if standing is not None:
                 return no(f"{standing.name} is still present: {standing.row.reads}", standing.row.remedy)
-            return yes(_disarmed("reset"), "reset; arm when the area around the blade is clear")
+            if command.stop_n != state.stop_n:
+                return no(f"stop number {state.stop_n} is latched: {state.reason}", "read why, then reset that one")
+            return yes(_disarmed(state, "reset"), "reset; arm when the area around the blade is clear")
         case cmd.Renew() | cmd.Release():
             return _lease_command(state, command, inputs.now_s, settings, yes, no)
     if state.lease is not None and state.lease.client != command.client:
@@ -199,11 +219,11 @@ def _obey(state: State, command: cmd.Command, inputs: Inputs, settings: MachineS
                 )
             if state.mode is Mode.AUTO:
                 return yes(state, "already automatic")
-            return yes(replace(_manual("automatic operation"), mode=Mode.AUTO), "automatic")
+            return yes(replace(_manual(state, "automatic operation"), mode=Mode.AUTO), "automatic")
         case cmd.Manual():
             if state.mode not in ARMED:
                 return no(f"manual operation needs an armed machine; it is {state.mode}", _way_to_armed(state.mode))
-            return yes(_manual("manual operation"), "manual")
+            return yes(_manual(state, "manual operation"), "manual")
     # What is left is a jog or a preset.
     if state.mode is not Mode.MANUAL:
         return no(f"moving by hand needs manual mode; the machine is {state.mode}", _way_to_manual(state.mode))
@@ -227,7 +247,7 @@ def _lease_command(
         return no("you hold no lease", "send the jog again")
     if isinstance(command, cmd.Renew):
         return yes(replace(state, lease=Lease(command.client, now_s + settings.lease_s)), "renewed")
-    return yes(_manual("released"), "released; holding")
+    return yes(_manual(state, "released"), "released; holding")
 
 
 def _arm(
@@ -257,21 +277,33 @@ def _arm(
 
 
 def _advance(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSettings) -> State:
-    """Finish arming, let leases lapse, go to a preset's next stage, follow the rule."""
+    """Finish arming, end what is held, go to a preset's next stage, follow the rule."""
     if state.arming_since_s is not None:
         if inputs.devices_active:
-            return _manual("armed")
+            return _manual(state, "armed")
         if inputs.arm_error:
-            return _disarmed(f"arming failed: {inputs.arm_error}")
+            return _disarmed(state, f"arming failed: {inputs.arm_error}")
         if inputs.now_s - state.arming_since_s > settings.arm_timeout_s:
-            return _disarmed(f"arming took longer than {settings.arm_timeout_s:g} s")
+            return _disarmed(state, f"arming took longer than {settings.arm_timeout_s:g} s")
         return state
-    if state.lease is not None and inputs.now_s > state.lease.expires_s:
-        return _manual(f"lease of {state.lease.client or 'the client'} lapsed")
-    if state.mode is Mode.MANUAL and state.later and inputs.settled:
-        state = replace(state, goals=state.later[0], later=state.later[1:])
+    held = _held(state, inputs)
+    if state.mode is Mode.MANUAL:
+        for axis, goal in state.goals.items():
+            if goal is not None and axis in held:
+                # What was asked for ends here: it must not go on by itself when the cause is gone.
+                state = _manual(state, f"{axis} was held: {held[axis]}")
+                break
+        if state.later and inputs.settled and not inputs.arrived:
+            state = _manual(state, "the preset ended: an axis stands at a bound short of its goal")
+        elif state.later and inputs.settled:
+            state = replace(state, goals=state.later[0], later=state.later[1:])
     if state.mode is Mode.AUTO:
-        decision = decide(state.decision, inputs.observation, inputs.settled, inputs.now_s, rule)
+        # A hold ends the decision, and the votes for the next: what moves afterwards was decided afterwards.
+        decision = (
+            Decision()
+            if "rotation" in held
+            else decide(state.decision, inputs.observation, inputs.settled, inputs.now_s, rule)
+        )
         state = replace(state, decision=decision, goals=Goals(rotation_deg=decision.angle_deg))
     if state.mode in ARMED:
         return replace(state, holding=_why_holding(state, inputs))
@@ -281,6 +313,17 @@ def _advance(state: State, inputs: Inputs, settings: MachineSettings, rule: Rule
 def _counting(state: State, inputs: Inputs) -> list[ActiveFault]:
     """The faults that count in this mode."""
     return [f for f in inputs.faults if state.mode is Mode.AUTO or not f.row.automatic_only]
+
+
+def _held(state: State, inputs: Inputs) -> dict[str, str]:
+    """Why an axis must stay where it is: a fault that holds it, or the gate that did not let its goal pass."""
+    by_part = {
+        part: f"{fault.name}: {fault.row.reads}"
+        for fault in reversed(_counting(state, inputs))  # the worst one last, so that it is the one told
+        if fault.row.reaction >= Reaction.HOLD
+        for part in fault.row.axes
+    }
+    return dict(inputs.held) | {axis: by_part[part] for axis, part in PARTS.items() if part in by_part}
 
 
 def _why_holding(state: State, inputs: Inputs) -> tuple[str, ...]:
@@ -299,16 +342,19 @@ def _unheld(goals: Goals, held: frozenset[str]) -> Goals:
     return Goals.of(**{axis: None if PARTS[axis] in held else goal for axis, goal in goals.items()})
 
 
-def _stopped(reason: str) -> State:
-    return State(mode=Mode.STOPPED, reason=reason)
+def _stopped(state: State, reason: str) -> State:
+    """Latched. A further stop is counted and its reason kept beside the first's."""
+    others = tuple(why for why in state.stops[:1] if why != reason)
+    stops = (*others, reason)
+    return State(mode=Mode.STOPPED, reason="; also: ".join(stops), stop_n=state.stop_n + 1, stops=stops)
 
 
-def _disarmed(reason: str) -> State:
-    return State(mode=Mode.DISARMED, reason=reason)
+def _disarmed(state: State, reason: str) -> State:
+    return State(mode=Mode.DISARMED, reason=reason, stop_n=state.stop_n)
 
 
-def _manual(reason: str) -> State:
-    return State(mode=Mode.MANUAL, reason=reason)
+def _manual(state: State, reason: str) -> State:
+    return State(mode=Mode.MANUAL, reason=reason, stop_n=state.stop_n)
 
 
 def _way_to_armed(mode: Mode) -> str:

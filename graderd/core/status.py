@@ -138,6 +138,7 @@ class Status(_Status):
     arming: bool = False
     holding: tuple[str, ...] = ()
     last_stop: str = ""
+    stop_n: int = 0
     soil: SoilStatus = SoilStatus()
     decision: DecisionStatus = DecisionStatus()
     axes: dict[str, AxisStatus] = {}

@@ -161,9 +161,11 @@ class Controller:
             self._soil = sensed.observation
         pose = _pose_of(sensed, settings.figures)
         self._faults = update_faults(self._faults, self._present(sensed), now_s, CATALOGUE)
-        self._clear_latches(sensed.commands)
-        readiness = self._readiness(sensed, pose)
         before = self._state
+        latched, event = self._faults, _unlatching(before, sensed.commands)
+        if event is not None:
+            self._faults = clear_faults(latched, event)
+        readiness = self._readiness(sensed, pose)
         result = step(
             before,
             Inputs(
@@ -173,6 +175,8 @@ class Controller:
                 observation=sensed.observation,
                 pose=pose,
                 settled=self._settled(pose),
+                arrived=self._arrived(pose),
+                held=self._held(),
                 devices_active=sensed.powered,
                 arm_error=sensed.arm_error,
                 unmet=tuple(r.unmet() for r in readiness if r.mandatory and not r.met),
@@ -182,6 +186,8 @@ class Controller:
             settings.rule,
         )
         self._state = state = result.state
+        if event is not None and state.mode is before.mode and state.arming_since_s is None:
+            self._faults = latched  # refused: what was latched stays
         if state.mode in ARMED and before.mode not in ARMED:
             self._gate = GateState()
             self._faults = clear_faults(self._faults, Clear.ON_REARM)
@@ -263,6 +269,22 @@ class Controller:
                 return False
         return True
 
+    def _arrived(self, pose: Pose) -> bool:
+        """Whether every axis with a goal stands where it was asked to go."""
+        return all(
+            (position := pose[axis]) is not None and abs(position - goal) <= self._settings.figures[axis].tolerance
+            for axis, goal in self._state.goals.items()
+            if goal is not None
+        )
+
+    def _held(self) -> dict[str, str]:
+        """Why the gate, or a driver, did not let an axis's goal pass in the tick before."""
+        return {
+            axis: decided.because
+            for axis, decided in self._axes.items()
+            if decided.requested is not None and decided.limited is None and decided.because
+        }
+
     def _present(self, sensed: Sensed) -> list[DeviceFault]:
         implausible = self._plausibility.judge(_samples(sensed), sensed.now_s)
         return [*sensed.faults, *implausible, *self._lift.faults(), *self._own_faults.present(sensed.now_s)]
@@ -270,15 +292,6 @@ class Controller:
     def _readiness(self, sensed: Sensed, pose: Pose) -> tuple[Requirement, ...]:
         axes = {name: AxisReadiness(axis.lifecycle, axis.problem, pose[name]) for name, axis in sensed.axes.items()}
         return requirements(self._state, axes, self._settings.figures, self._faults.active)
-
-    def _clear_latches(self, commands: tuple[cmd.AnyCommand, ...]) -> None:
-        """A reset or an arm lets go of latched faults whose cause is gone; what is still there stays and refuses."""
-        if any(isinstance(command, cmd.Stop) for command in commands):
-            return
-        if any(isinstance(command, cmd.Reset) for command in commands):
-            self._faults = clear_faults(self._faults, Clear.ON_RESET)
-        if self._state.mode is Mode.DISARMED and any(isinstance(command, cmd.Arm) for command in commands):
-            self._faults = clear_faults(self._faults, Clear.ON_REARM)
 
     def _note_late(self, late_s: float, now_s: float) -> None:
         if late_s <= self._settings.overrun_s:
@@ -291,6 +304,17 @@ class Controller:
         lapsed = before.lease is not None and self._state.lease is None and now_s > before.lease.expires_s
         if lapsed and before.lease is not None and self._state.mode in ARMED:
             self._own_faults.tell("lease_lapsed", f"client {before.lease.client or '?'}", now_s, LAPSE_SHOWN_S)
+
+
+def _unlatching(state: State, commands: tuple[cmd.AnyCommand, ...]) -> Clear | None:
+    """Which latches these commands let go of, if the machine accepts them: a reset of a stop, or an arm."""
+    if any(isinstance(command, cmd.Stop) for command in commands):
+        return None
+    if state.mode is Mode.STOPPED and any(isinstance(command, cmd.Reset) for command in commands):
+        return Clear.ON_RESET
+    if state.mode is Mode.DISARMED and any(isinstance(command, cmd.Arm) for command in commands):
+        return Clear.ON_REARM
+    return None
 
 
 def _pose_of(sensed: Sensed, figures: Mapping[str, AxisFigures]) -> Pose:

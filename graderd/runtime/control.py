@@ -21,6 +21,7 @@ from graderd.runtime.state_file import StateFile
 
 MAX_COMMANDS_PER_TICK = 32
 LATENESS_WINDOW_N = 500
+STOP_REMEDY = "read its reason, reset that stop, then ask again"
 
 log = logging.getLogger(__name__)
 
@@ -99,9 +100,16 @@ class ControlLoop:
         return await future
 
     def stop_now(self, command: cmd.Stop) -> cmd.Reply:
-        """Stop without waiting for a tick: hold on every wire now, then latch."""
+        """Stop without waiting for a tick: hold on every wire now, then latch. What was queued before it is void."""
         self._hold_all()
-        return self._step((command,))[0]
+        reply = self._step((command,))[0]
+        while self._queue:
+            queued, future = self._queue.popleft()
+            if not future.done():
+                future.set_result(
+                    cmd.Reply(command=queued.command, accepted=False, message="a stop came first", remedy=STOP_REMEDY)
+                )
+        return reply
 
     # ---- the tick -------------------------------------------------------------------------------------------------
 

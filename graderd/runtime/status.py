@@ -46,6 +46,7 @@ def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) 
         arming=state.arming_since_s is not None,
         holding=state.holding,
         last_stop=str(loop.last_stop) if loop.last_stop else "",
+        stop_n=state.stop_n,
         soil=_soil(tick.soil, eyes.frames_per_s, now_s),
         decision=DecisionStatus(
             zone=decision.zone,

@@ -11,7 +11,13 @@ until_mode() { # MODE SECONDS
     fail "not $1 after $2 s but $(mode)"
 }
 # At low priority: unpacking takes the guest's one processor for seconds, and the simulated devices would miss theirs.
-install() { nice -n 19 dpkg -i --force-unsafe-io "$1"; }
+# Without the place of the socket, which is the script's knowledge, not the package's.
+install() { env -u GRADERD_SOCKET nice -n 19 dpkg -i --force-unsafe-io "$1"; }
+pid() { systemctl show --value -p MainPID graderd; }
+policy() { # STATUS: what policy-rc.d says to whoever asks
+    printf '#!/bin/sh\nexit %s\n' "$1" >/usr/sbin/policy-rc.d
+    chmod 755 /usr/sbin/policy-rc.d
+}
 ready() {
     for _ in $(seq 60); do graderd arm >/dev/null 2>&1 && return 0; sleep 1; done
     fail "cannot be armed: $(graderd arm 2>&1)"
@@ -20,7 +26,7 @@ ready() {
 step "installed by apt in the clean root: $(dpkg-query -W graderd)"
 [ "$(systemctl is-active graderd)" = inactive ] || fail "it was started without being asked to"
 getent passwd graderd >/dev/null || fail "no user graderd"
-[ "$(stat -c '%U:%G %a' /etc/graderd)" = "root:graderd 770" ] || fail "rights of /etc/graderd"
+[ "$(stat -c '%U:%G %a' /etc/graderd)" = "root:graderd 750" ] || fail "rights of /etc/graderd"
 [ -r /usr/share/man/man1/graderd.1.gz ] && [ -r /usr/share/bash-completion/completions/graderd ] || fail "man, completion"
 [ -z "$(systemd-analyze verify --man=no graderd.service 2>&1)" ] || fail "systemd-analyze verify"
 
@@ -34,10 +40,30 @@ sed -i '/^\[camera\]/,/^\[camera.calibration\]/s/^#rate_hz = .*/rate_hz = 3.0/' 
 mkdir -p /etc/systemd/system/graderd.service.d
 cp /usr/share/graderd/dropins/realtime.conf /etc/systemd/system/graderd.service.d/
 
-step "asked for: started at once on the simulated grader"
+# The daemon's socket is not where it usually is: whoever asks whether the machine moves must find it all the same.
+sed -i 's|^#socket = .*|socket = "/run/graderd/elsewhere.sock"|' /etc/graderd/graderd.toml
+grep -q elsewhere /etc/graderd/graderd.toml || fail "no api.socket in the configuration"
+export GRADERD_SOCKET=/run/graderd/elsewhere.sock
+
+step "asked for where policy-rc.d forbids it: not started"
 export GRADERD_SIM=1
+policy 101
+install "$package" >/tmp/forbidden 2>&1 || fail "$(cat /tmp/forbidden)"
+[ "$(systemctl is-active graderd)" = inactive ] || fail "started against policy-rc.d"
+rm /usr/sbin/policy-rc.d
+
+step "asked for: started at once on the simulated grader; no device of others is announced anew"
+# Were every network interface announced anew, lo would be.
+echo 'ACTION=="add", RUN+="/bin/sh -c '"'echo %p >>/run/announced'"'"' >/etc/udev/rules.d/99-hil.rules
+udevadm control --reload
+udevadm trigger --action=add --subsystem-match=net && udevadm settle
+grep -q '/lo$' /run/announced || fail "the test does not see what is announced"
+rm /run/announced
 install "$package" >/dev/null
 unset GRADERD_SIM
+udevadm settle
+[ ! -e /run/announced ] || fail "announced anew: $(cat /run/announced)"
+rm /etc/udev/rules.d/99-hil.rules
 until_mode disarmed 60
 step "used: armed, blade turned"
 for attempt in 1 2 3 4; do
@@ -49,13 +75,23 @@ done
 
 step "an upgrade while armed is refused, and nothing has changed"
 [ "$(mode)" = manual ] || ready
-pid=$(systemctl show --value -p MainPID graderd)
+pid=$(pid)
 if install "$newer" >/tmp/refused 2>&1; then fail "the upgrade went through while armed"; fi
 grep -q armed /tmp/refused || fail "no reason given: $(cat /tmp/refused)"
-[ "$(systemctl show --value -p MainPID graderd)" = "$pid" ] || fail "the daemon was restarted while armed"
+[ "$(pid)" = "$pid" ] || fail "the daemon was restarted while armed"
 [ "$(dpkg-query -W -f '${Version}' graderd)" != 99.0.0 ] || fail "the version changed"
 graderd disarm >/dev/null
 until_mode disarmed 10
+
+step "a removal while armed is refused too, whatever its configuration says by now of the socket"
+ready
+sed -i 's|elsewhere|nowhere|' /etc/graderd/graderd.toml
+if env -u GRADERD_SOCKET dpkg --remove graderd >/tmp/refused 2>&1; then fail "it was removed while armed"; fi
+grep -q 'is armed' /tmp/refused || fail "no reason given: $(cat /tmp/refused)"
+[ "$(pid)" = "$pid" ] || fail "the daemon was stopped while armed"
+graderd disarm >/dev/null
+until_mode disarmed 10
+sed -i 's|nowhere|elsewhere|' /etc/graderd/graderd.toml
 
 step "an upgrade when disarmed keeps configuration and calibration, migrates an old file with a backup, restarts"
 # The newer package's format is 2: what stood in [yard] it wants in [rotation].

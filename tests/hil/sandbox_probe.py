@@ -78,6 +78,7 @@ def others() -> None:
 
 MUST_FAIL: dict[str, Callable[[], object]] = {
     "write /etc": lambda: write("/etc/hil"),
+    "write /etc/graderd": lambda: write("/etc/graderd/hil"),
     "write /usr": lambda: write("/usr/hil"),
     "write /opt/graderd": lambda: write("/opt/graderd/lib/common/graderd/__init__.py"),
     "write /var/lib": lambda: write("/var/lib/hil"),
@@ -109,7 +110,7 @@ MUST_FAIL: dict[str, Callable[[], object]] = {
 }
 MUST_WORK: dict[str, Callable[[], object]] = {
     "state directory": lambda: write(os.path.join(os.environ["STATE_DIRECTORY"], "hil")),
-    "save configuration": lambda: write("/etc/graderd/hil"),
+    "read configuration": lambda: read("/etc/graderd/graderd.toml"),
     "CAN socket": lambda: socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).bind(("",)),
     "unix socket": lambda: socket.socket(socket.AF_UNIX, socket.SOCK_STREAM),
     "private /tmp": lambda: write("/tmp/hil"),
@@ -135,7 +136,6 @@ def main() -> None:
             action()
         except (OSError, subprocess.SubprocessError) as error:
             broken.append(f"{name}: {error}")
-    os.unlink("/etc/graderd/hil")
     print(json.dumps({"tried_n": len(MUST_FAIL), "got_through": through, "broken": broken}))  # noqa: T201
 
 

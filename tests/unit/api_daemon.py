@@ -232,6 +232,7 @@ class FakeDaemon:
             arming=self.state.arming_since_s is not None,
             holding=self.state.holding,
             last_stop=self.state.reason if self.state.mode is Mode.STOPPED else "",
+            stop_n=self.state.stop_n,
             soil=SoilStatus(),
             axes=axes,
             faults=tuple(self.held.values()),

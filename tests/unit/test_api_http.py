@@ -57,7 +57,7 @@ async def test_the_way_through_the_modes(tmp_path: Path) -> None:
         refused = await client.post("/v1/commands", json={"command": "arm"})
         assert refused.status_code == 409
         assert refused.json() == {"error": "stopped: test", "where": "arm", "remedy": "reset first, then arm"}
-        assert (await client.post("/v1/commands", json={"command": "reset"})).status_code == 200
+        assert (await client.post("/v1/commands", json={"command": "reset", "stop_n": 1})).status_code == 200
         assert daemon.status().mode is Mode.DISARMED
 
 

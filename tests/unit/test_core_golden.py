@@ -87,10 +87,10 @@ def machine_answers() -> Iterator[tuple[str, Any]]:
     stages = (Goals(tilt_mm=5.0), Goals(tilt_mm=6.0), Goals(tilt_mm=7.0))
     two = (Unmet("tilt", "silent", "look"), Unmet("stop", "pressed", "release"), Unmet("lift_left", "far", "look"))
     many: dict[str, tuple[State, tuple[cmd.Command, ...], dict[str, Any]]] = {
-        "stop and reset": (STATES["manual"], (cmd.Reset(), cmd.Stop(client="x", reason="why")), {}),
+        "stop and reset": (STATES["manual"], (cmd.Reset(stop_n=0), cmd.Stop(client="x", reason="why")), {}),
         "two commands": (STATES["manual"], (cmd.Auto(), cmd.Manual()), {}),
-        "reset, fault present": (STATES["stopped"], (cmd.Reset(),), {"faults": (fault(Reaction.STOP),)}),
-        "reset, fault gone": (STATES["stopped"], (cmd.Reset(),), {"faults": (gone,)}),
+        "reset, fault present": (STATES["stopped"], (cmd.Reset(stop_n=0),), {"faults": (fault(Reaction.STOP),)}),
+        "reset, fault gone": (STATES["stopped"], (cmd.Reset(stop_n=0),), {"faults": (gone,)}),
         "renew of another": (jogging, (cmd.Renew(client="b"),), {}),
         "release of another": (jogging, (cmd.Release(client="b"),), {}),
         "another while nobody's jog": (unnamed, (cmd.Manual(client="b"),), {}),
@@ -102,7 +102,7 @@ def machine_answers() -> Iterator[tuple[str, Any]]:
         "arm while released": (STATES["disarmed"], (cmd.Arm(),), {"devices_active": True}),
         "arm with a latched fault": (STATES["disarmed"], (cmd.Arm(),), {"devices_active": False,
                                      "faults": (replace(fault(Reaction.DISARM), present=False),)}),
-        "stop, reset, arm": (STATES["manual"], (cmd.Stop(), cmd.Reset(), cmd.Arm()), {}),
+        "stop, reset, arm": (STATES["manual"], (cmd.Stop(), cmd.Reset(stop_n=0), cmd.Arm()), {}),
         "a preset from where it is": (STATES["manual"], (cmd.Preset(name="p"),), {
             "resolve": lambda _, pose: (Goals(pose.rotation_deg, pose.lift_left_mm),)}),
         "renewed later": (jogging, (cmd.Renew(client="a"),), {"now_s": NOW_S + 0.25}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import replace
 from typing import Any
 
@@ -34,8 +35,8 @@ def inputs(*commands: cmd.Command, now_s: float = NOW_S, **changes: Any) -> Inpu
     return replace(base, **changes)
 
 
-def fault(reaction: Reaction, axes: frozenset[str] = ALL_AXES, name: str = "camera.test") -> ActiveFault:
-    row = FaultRow(name, "it is broken", "cause", "mend it", reaction, 0.0, Clear.WHEN_GONE, axes)
+def fault(reaction: Reaction, axes: Set[str] = ALL_AXES, name: str = "camera.test") -> ActiveFault:
+    row = FaultRow(name, "it is broken", "cause", "mend it", reaction, 0.0, Clear.WHEN_GONE, frozenset(axes))
     return ActiveFault(name, row, "detail", NOW_S - 0.6, True)
 
 
@@ -60,7 +61,7 @@ EVENTS: dict[str, Inputs] = {
     "arm, not ready": inputs(cmd.Arm(client="a"), unmet=(Unmet("tilt", "silent", "look"),)),
     "disarm": inputs(cmd.Disarm(client="a"), devices_active=True),
     "stop": inputs(cmd.Stop(client="b"), devices_active=True),
-    "reset": inputs(cmd.Reset(client="a"), devices_active=True),
+    "reset": inputs(cmd.Reset(client="a", stop_n=0), devices_active=True),
     "auto": inputs(cmd.Auto(client="a"), devices_active=True),
     "manual": inputs(cmd.Manual(client="a"), devices_active=True),
     "jog": inputs(J, devices_active=True),
@@ -98,8 +99,8 @@ TABLE: dict[str, tuple[str, str, str, str, str, str]] = {
     "devices lost": (D, R, D, D, D, S),
     "arm error": (D, D, D, D, D, S),
     "warn": (D, M, M, J_, A, S),
-    "hold": (D, M, M, J_, A, S),
-    "retreat": (D, M, M, J_, M, S),
+    "hold": (D, M, M, M, A, S),
+    "retreat": (D, M, M, M, M, S),
     "fault disarm": (D, D, D, D, D, S),
     "fault stop": (S, S, S, S, S, S),
     "later": (D, M, M, M, A, S),
@@ -150,17 +151,33 @@ def test_stop_wins_over_commands_of_the_same_tick() -> None:
     assert [r.accepted for r in result.replies[1:]] == [False, False, False]
 
 
-def test_stop_is_idempotent_and_keeps_its_first_reason() -> None:
+def test_a_second_stops_reason_is_kept_beside_the_firsts_and_each_is_counted() -> None:
     first = do(AUTO, cmd.Stop(reason="dog on the site"), devices_active=True).state
     second = do(first, cmd.Stop(reason="again"))
     assert second.replies[0].accepted
-    assert second.state.reason == "dog on the site"
+    assert second.state.reason == "dog on the site; also: again"
+    third = do(second.state, cmd.Stop(reason="dog on the site")).state
+    assert third.reason == "dog on the site"
+    assert (first.stop_n, second.state.stop_n, third.stop_n) == (1, 2, 3)
+    failed = do(first, faults=(fault(Reaction.STOP),)).state
+    assert failed.reason == "dog on the site; also: camera.test: it is broken"
+    assert do(failed, faults=(fault(Reaction.STOP),)).state == failed
+
+
+def test_a_reset_clears_the_stop_it_names_and_none_that_came_after() -> None:
+    first = do(AUTO, cmd.Stop(reason="dog on the site"), devices_active=True).state
+    second = do(first, cmd.Stop(reason="child on the site")).state
+    late = do(second, cmd.Reset(stop_n=first.stop_n))
+    assert late.state == second
+    assert not late.replies[0].accepted
+    assert "child on the site" in late.replies[0].message
+    assert do(second, cmd.Reset(stop_n=second.stop_n)).state.mode is Mode.DISARMED
 
 
 def test_stopped_is_left_only_by_reset_then_arm() -> None:
     for command in (cmd.Arm(), cmd.Auto(), cmd.Manual(), J, cmd.Disarm(), cmd.Renew(client="a")):
         assert do(STOPPED, command, devices_active=True).state.mode is Mode.STOPPED
-    reset = do(STOPPED, cmd.Reset()).state
+    reset = do(STOPPED, cmd.Reset(stop_n=0)).state
     assert kind(reset) == "disarmed"
     arming = do(reset, cmd.Arm()).state
     assert kind(arming) == "arming"
@@ -168,7 +185,7 @@ def test_stopped_is_left_only_by_reset_then_arm() -> None:
 
 
 def test_a_reset_of_the_same_tick_does_not_undo_a_stop() -> None:
-    for commands in ((cmd.Stop(), cmd.Reset()), (cmd.Reset(), cmd.Stop())):
+    for commands in ((cmd.Stop(), cmd.Reset(stop_n=0)), (cmd.Reset(stop_n=0), cmd.Stop())):
         for state in (AUTO, STOPPED):
             result = do(state, *commands, devices_active=True)
             assert result.state.mode is Mode.STOPPED
@@ -183,7 +200,7 @@ def test_a_latched_fault_of_severity_disarm_keeps_arming_away() -> None:
 
 
 def test_reset_is_refused_while_the_fault_is_present() -> None:
-    result = do(STOPPED, cmd.Reset(), faults=(fault(Reaction.STOP),))
+    result = do(STOPPED, cmd.Reset(stop_n=0), faults=(fault(Reaction.STOP),))
     assert result.state.mode is Mode.STOPPED
     assert not result.replies[0].accepted
     assert result.replies[0].remedy == "mend it"
@@ -191,7 +208,7 @@ def test_reset_is_refused_while_the_fault_is_present() -> None:
 
 def test_a_latched_fault_that_is_gone_lets_reset_pass() -> None:
     gone = replace(fault(Reaction.STOP), present=False)
-    result = do(STOPPED, cmd.Reset(), faults=(gone,))
+    result = do(STOPPED, cmd.Reset(stop_n=0), faults=(gone,))
     assert result.replies[0].accepted
 
 
@@ -276,17 +293,41 @@ def test_a_blind_camera_holds_automatic_operation_and_not_the_operator() -> None
 
 
 def test_faults_hold_only_the_axes_they_name() -> None:
-    moving = replace(JOGGING, goals=Goals(1.0, 2.0, 3.0, 4.0))
-    held = {
-        "rotation": Goals(None, 2.0, 3.0, 4.0),
-        "lift": Goals(1.0, None, None, 4.0),
-        "tilt": Goals(1.0, 2.0, 3.0, None),
-    }
-    for axis, goals in held.items():
-        result = do(moving, devices_active=True, faults=(fault(Reaction.HOLD, frozenset({axis})),))
-        assert result.intents.goals == goals
-    assert do(moving, devices_active=True, faults=(fault(Reaction.HOLD),)).intents.goals.empty
-    assert do(moving, devices_active=True, faults=(fault(Reaction.WARN),)).intents.goals == Goals(1.0, 2.0, 3.0, 4.0)
+    goals = {"rotation": Goals(1.0), "lift": Goals(None, 2.0, 3.0), "tilt": Goals(tilt_mm=4.0)}
+    for moved, wanted in goals.items():
+        for named in goals:
+            result = do(replace(JOGGING, goals=wanted), devices_active=True, faults=(fault(Reaction.HOLD, {named}),))
+            assert result.intents.goals == (Goals() if moved == named else wanted)
+        moving = replace(JOGGING, goals=wanted)
+        assert do(moving, devices_active=True, faults=(fault(Reaction.HOLD),)).intents.goals.empty
+        assert do(moving, devices_active=True, faults=(fault(Reaction.WARN),)).intents.goals == wanted
+
+
+def test_what_was_held_does_not_go_on_by_itself() -> None:
+    jogging = do(MANUAL, J, devices_active=True).state
+    for held in ({"faults": (fault(Reaction.HOLD),)}, {"held": {"rotation": "no fresh measurement of this axis"}}):
+        ended = do(jogging, devices_active=True, **held)
+        assert ended.intents.goals.empty
+        assert ended.state.reason.startswith("rotation was held: ")
+        assert not do(ended.state, cmd.Renew(client="a"), devices_active=True).replies[0].accepted
+        turning = replace(AUTO, decision=Decision(Zone.LEFT, 30.0, NOW_S - 5.0), goals=Goals(rotation_deg=30.0))
+        after = do(turning, devices_active=True, **held).state
+        assert after.decision == Decision()
+        assert do(after, devices_active=True).intents.goals.empty
+
+
+def test_a_preset_that_stands_short_of_a_stage_ends() -> None:
+    first = do(MANUAL, cmd.Preset(name="transport", client="a"), devices_active=True, arrived=False).state
+    ended = do(first, cmd.Renew(client="a"), devices_active=True, settled=True, arrived=False)
+    assert ended.intents.goals.empty
+    assert "short of its goal" in ended.state.reason
+
+
+def test_a_late_renewal_renews_nothing() -> None:
+    moving = do(MANUAL, J, devices_active=True).state
+    late = do(moving, cmd.Renew(client="a"), devices_active=True, now_s=NOW_S + SETTINGS.lease_s + 0.001)
+    assert not late.replies[0].accepted
+    assert late.intents.goals.empty
 
 
 def test_holding_says_why_and_since_when() -> None:
@@ -314,7 +355,7 @@ def test_leaving_auto_forgets_the_decision() -> None:
 
 
 COMMANDS: list[cmd.Command] = [
-    cmd.Arm(client="a"), cmd.Disarm(), cmd.Stop(), cmd.Reset(), cmd.Auto(client="a"), cmd.Manual(client="a"), J,
+    cmd.Arm(client="a"), cmd.Disarm(), cmd.Stop(), cmd.Reset(stop_n=0), cmd.Auto(client="a"), cmd.Manual(client="a"), J,
     cmd.Preset(name="p", client="b"), cmd.Renew(client="a"), cmd.Renew(client="b"), cmd.Release(client="a"),
 ]  # fmt: skip
 FAULTS = [fault(reaction, axes) for reaction in Reaction for axes in (ALL_AXES, frozenset({"rotation"}))]

@@ -35,14 +35,14 @@ COMMANDS: tuple[tuple[cmd.Command, ...], ...] = (
     (cmd.Arm(client="a"),),
     (cmd.Disarm(),),
     (cmd.Stop(),),
-    (cmd.Reset(),),
+    (cmd.Reset(stop_n=0),),
     (cmd.Auto(client="a"),),
     (cmd.Manual(client="a"),),
     (cmd.Jog(axis="rotate", value=5.0, client="a"),),
     (cmd.Preset(name="two_stages", client="b"),),
     (cmd.Renew(client="a"),),
     (cmd.Release(client="a"),),
-    (cmd.Reset(), cmd.Arm(client="a")),
+    (cmd.Reset(stop_n=0), cmd.Arm(client="a")),
     (cmd.Arm(client="a"), cmd.Stop()),
 )
 ZONES = (None, Zone.LEFT, Zone.RIGHT, Zone.UNKNOWN)
@@ -107,6 +107,8 @@ def canonical(state: State, passed_s: float) -> State:
     return replace(
         state,
         reason="",
+        stop_n=0,
+        stops=(),
         holding=(),
         arming_since_s=None if state.arming_since_s is None else relative(state.arming_since_s),
         lease=None if state.lease is None else Lease(state.lease.client, relative(state.lease.expires_s)),

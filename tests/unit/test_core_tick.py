@@ -7,10 +7,11 @@ is meant: ``python -m tests.unit.test_core_tick`` writes it anew; read the diffe
 from __future__ import annotations
 
 import ast
+import asyncio
 import json
 import math
 from collections import Counter
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ from graderd.config import Config
 from graderd.core import commands as cmd
 from graderd.core import readiness
 from graderd.core.axes import ACTUATORS, AXES
+from graderd.core.faults.catalogue import CATALOGUE
+from graderd.core.faults.monitor import Clear, Reaction
 from graderd.core.machine import Mode
 from graderd.core.soil import SoilObservation, Zone
 from graderd.core.tick import AxisSensed, Controller, Sensed, Tick
@@ -78,8 +81,8 @@ def stretch_of_work() -> list[Sensed]:
         60: (cmd.Preset(name="transport", client="a"),),
         70: (cmd.Renew(client="a"),),
         90: (cmd.Auto(client="a"),),
-        260: (cmd.Stop(reason="enough", client="b"), cmd.Reset(client="a")),
-        270: (cmd.Reset(client="a"),),
+        260: (cmd.Stop(reason="enough", client="b"), cmd.Reset(client="a", stop_n=0)),
+        270: (cmd.Reset(client="a", stop_n=1),),
     }
     for number in range(300):
         now_s = 100.0 + TICK_S * number
@@ -165,7 +168,7 @@ def test_writing_sensed_down_and_reading_it_loses_nothing() -> None:
 
 
 def test_replies_come_in_the_order_of_the_commands() -> None:
-    commands = (cmd.Arm(client="a"), cmd.Stop(client="b"), cmd.Reset(client="a"))
+    commands = (cmd.Arm(client="a"), cmd.Stop(client="b"), cmd.Reset(client="a", stop_n=0))
     tick = Controller(SETTINGS).step(Sensed(1.0, standing(1.0, HOME), commands=commands))
     assert [reply.command for reply in tick.replies] == ["arm", "stop", "reset"]
     assert tick.stopped_now
@@ -184,6 +187,45 @@ def test_a_held_axis_has_not_arrived() -> None:
         now_s = 1.08 + TICK_S * number
         tick = controller.step(step(now_s, standing(now_s, at), faults=(low,), commands=(cmd.Renew(),)))
     assert not tick.axes["rotation"].arrived
+
+
+def test_a_latch_is_let_go_only_by_what_the_machine_accepts() -> None:
+    """A jammed servo that came free, a reset with nothing to reset: the hold stays until the machine is armed anew."""
+    latching = next(row for row in CATALOGUE.values() if row.clear is Clear.ON_REARM and row.reaction is Reaction.HOLD)
+    device, _, condition = latching.key.replace("actuator", "lift_left").partition(".")
+    controller, step = Controller(SETTINGS), partial(Sensed, powered=True)
+    jammed = (DeviceFault(device, condition, "", 1.0),)
+    controller.step(Sensed(1.0, standing(1.0, HOME, Lifecycle.STANDBY), commands=(cmd.Arm(),)))
+    for number in range(100):
+        controller.step(step(1.1 + TICK_S * number, standing(1.1 + TICK_S * number, HOME), faults=jammed))
+    commands: tuple[cmd.AnyCommand, ...] = (cmd.Reset(stop_n=0), cmd.Arm(), cmd.Manual(), cmd.Auto())
+    for number, command in enumerate(commands):
+        now_s = 4.0 + TICK_S * number
+        tick = controller.step(step(now_s, standing(now_s, HOME), commands=(command,)))
+        assert [fault.name for fault in tick.faults] == [f"{device}.{condition}"], command
+    off = partial(standing, at=HOME, lifecycle=Lifecycle.STANDBY)
+    controller.step(step(5.0, standing(5.0, HOME), commands=(cmd.Disarm(),)))
+    unmeasured = {name: replace(axis, lifecycle=Lifecycle.FAILED) for name, axis in off(5.1).items()}
+    refused = controller.step(Sensed(5.1, unmeasured, commands=(cmd.Arm(),)))
+    assert not refused.replies[0].accepted
+    assert refused.faults
+    assert not controller.step(Sensed(5.2, off(5.2), commands=(cmd.Arm(),))).faults
+
+
+async def test_a_stop_makes_void_what_was_asked_before_it(tmp_path: Path) -> None:
+    machine = FakeMachine()
+    loop = ControlLoop(Config(), machine.devices, machine.eyes, machine.clock, StateFile(str(tmp_path)))
+    first = loop.stop_now(cmd.Stop(reason="dog", client="a"))
+    asked = asyncio.create_task(loop.command(cmd.Reset(client="b", stop_n=loop.tick.state.stop_n)), name="reset")
+    await asyncio.sleep(0)
+    second = loop.stop_now(cmd.Stop(reason="child", client="c"))
+    assert first.accepted
+    assert second.accepted
+    assert not (await asked).accepted
+    loop.turn()
+    assert loop.tick.state.mode is Mode.STOPPED
+    assert loop.tick.state.reason == "dog (by a); also: child (by c)"
+    await loop._power.close()
 
 
 async def test_each_device_is_asked_once_a_tick_and_readiness_is_made_once(

@@ -212,11 +212,11 @@ async def test_an_unknown_condition_of_a_driver_stops_the_machine(bench: Bench) 
     bench.machine.rotation.present.append(fault)
     await bench.ticks(2)
     assert bench.loop.tick.state.mode is Mode.STOPPED
-    refused = await bench.do(cmd.Reset(client="t"))
+    refused = await bench.do(cmd.Reset(client="t", stop_n=1))
     assert not refused.accepted
     bench.machine.rotation.present.clear()
     await bench.ticks(1)
-    assert (await bench.do(cmd.Reset(client="t"))).accepted
+    assert (await bench.do(cmd.Reset(client="t", stop_n=1))).accepted
     assert bench.loop.tick.faults == ()
 
 

@@ -1,13 +1,15 @@
 """Faults of the camera and of the pictures. Without a good picture there is nothing to go by: the rotation holds.
 
-What comes and goes by itself (dust, a restart of the worker) lets the rule go on afterwards; what does not, or makes
-all further decisions doubtful, ends automatic operation and leaves the blade to the operator.
+What comes and goes by itself (a restart of the worker) lets the rule go on afterwards, with fresh votes. What makes
+all further decisions doubtful, or sends a person to the lens or the blade, ends automatic operation and leaves the
+blade to the operator.
 """
 
 from graderd.core.faults.monitor import FaultRow, Reaction
 
 ROTATION = frozenset({"rotation"})
 NO_AXIS: frozenset[str] = frozenset()
+AGAIN = "then 'graderd auto' again"
 LENS = "clean the lens, look for what stands before it"
 
 ROWS = (
@@ -32,8 +34,8 @@ ROWS = (
         "camera.black",
         "the picture is black",
         "no light, a covered lens, or an exposure set too short",
-        f"switch the work light on, {LENS}, look at exposure_us",
-        Reaction.HOLD,
+        f"switch the work light on, {LENS}, look at exposure_us; {AGAIN}",
+        Reaction.RETREAT,
         debounce_s=0.1,
         axes=ROTATION,
         automatic_only=True,
@@ -42,8 +44,8 @@ ROWS = (
         "camera.blown_out",
         "the picture is too bright to see anything",
         "the sun or a lamp shines into the lens, or the exposure is set too long",
-        "shade the lens, look at exposure_us",
-        Reaction.HOLD,
+        f"shade the lens, look at exposure_us; {AGAIN}",
+        Reaction.RETREAT,
         debounce_s=0.1,
         axes=ROTATION,
         automatic_only=True,
@@ -52,8 +54,8 @@ ROWS = (
         "camera.blocked",
         "something covers the lens",
         "mud, dust, a leaf or a hand on it",
-        LENS,
-        Reaction.HOLD,
+        f"{LENS}; {AGAIN}",
+        Reaction.RETREAT,
         debounce_s=0.1,
         axes=ROTATION,
         automatic_only=True,
@@ -71,8 +73,8 @@ ROWS = (
         "camera.blurred",
         "the picture is blurred",
         "a dirty or wet lens, or strong shaking",
-        f"{LENS}; check the camera's mount",
-        Reaction.HOLD,
+        f"{LENS}; check the camera's mount; {AGAIN}",
+        Reaction.RETREAT,
         debounce_s=0.5,
         axes=ROTATION,
         automatic_only=True,
@@ -108,8 +110,8 @@ ROWS = (
         "camera.depth_missing",
         "the camera gives no depth, or too little",
         "direct sun, a shiny or wet blade, or a stream that has stopped",
-        "shade the blade, paint it matt; pull and plug the camera if it stays",
-        Reaction.HOLD,
+        f"shade the blade, paint it matt; pull and plug the camera if it stays; {AGAIN}",
+        Reaction.RETREAT,
         debounce_s=0.5,
         axes=ROTATION,
         automatic_only=True,

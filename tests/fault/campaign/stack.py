@@ -200,8 +200,10 @@ class Stack:
         return self.status
 
     async def command(self, name: str, /, **fields: Any) -> JsonObject:
-        """One command; ``accepted`` tells whether it was obeyed."""
+        """One command; ``accepted`` tells whether it was obeyed. A reset names the stop that is latched now."""
         try:
+            if name == "reset":
+                fields = {"stop_n": (await self.client.get("/v1/status")).json()["stop_n"], **fields}
             response = await self.client.post("/v1/commands", json={"command": name, "client": CLIENT, **fields})
         except httpx.TransportError as error:
             return {"accepted": False, "message": f"no answer: {error!r}"}
