@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from graderd.config import Config
+from graderd.core.plausibility import PlausibilityMonitor, axis_sample, motion_figures
 from graderd.drivers.dynamixel import Ph54Rotator
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import Ph54Settings
@@ -27,15 +29,19 @@ PATIENCE_S = 15.0
 
 @dataclass
 class Bench:
-    """A rotator and the virtual servo it drives."""
+    """A rotator and the virtual servo it drives, with the daemon's judgement of its motion."""
 
     rotator: Ph54Rotator
     servo: VirtualServo
     bus: VirtualServoBus
     clock: AwakeClock
+    monitor: PlausibilityMonitor
 
     def conditions(self) -> set[str]:
-        return {f.condition for f in self.rotator.faults()}
+        """What the driver tells, and what the readings say about the motion."""
+        sample = axis_sample("rotation", self.rotator.lifecycle, self.rotator.telemetry())
+        judged = self.monitor.judge(() if sample is None else (sample,), self.clock.now_s())
+        return {f.condition for f in (*self.rotator.faults(), *judged)}
 
     async def until(self, met: Callable[[], object], what: str = "", timeout_s: float = PATIENCE_S) -> None:
         """Wait until ``met()`` is true, looking every few milliseconds."""
@@ -117,7 +123,8 @@ async def bench(
     try:
         if opened:
             await rotator.open()
-        yield Bench(rotator, servo, bus, clock)
+        figures = Config(rotation=settings).figures()
+        yield Bench(rotator, servo, bus, clock, PlausibilityMonitor(motion_figures(settings, figures)))
     finally:
         await rotator.close()
         await bus.close()

@@ -26,6 +26,7 @@ class FakeAxis:
         self.name = name
         self.clock = clock
         self.position = position
+        self.goal: float | None = None
         self.log = log
         self.lifecycle = Lifecycle.STANDBY
         self.present: list[DeviceFault] = []
@@ -67,11 +68,13 @@ class FakeAxis:
             raise CommandRangeError(self.name, "beyond")
         self.sent = Reading(goal, self.clock.now_s())
         self.log.append(f"{self.name} goal {goal:.3f}")
+        self.goal = goal
         if not self.stuck:
             self.position = goal
 
     def hold(self) -> None:
         self.log.append(f"{self.name} hold")
+        self.goal = None
         self.held_n += 1
         if self.hold_raises:
             raise RuntimeError("driver bug")
@@ -93,6 +96,7 @@ class FakeAxis:
     async def disarm(self) -> None:
         if self.lifecycle is Lifecycle.ACTIVE:
             self.lifecycle = Lifecycle.STANDBY
+        self.goal = None
         self.log.append(f"{self.name} disarm")
 
     async def close(self) -> None:
@@ -109,7 +113,7 @@ class FakeRotator(FakeAxis):
     """A rotator that is where it was told to be."""
 
     def telemetry(self) -> RotatorTelemetry:
-        return RotatorTelemetry(angle_deg=self.reading(), goal_sent_deg=self.sent)
+        return RotatorTelemetry(angle_deg=self.reading(), goal_sent_deg=self.sent, goal_deg=self.goal)
 
     def set_goal_deg(self, goal_deg: float) -> None:
         self.go(goal_deg)
@@ -121,7 +125,7 @@ class FakeActuator(FakeAxis):
     LOST = "no_feedback"
 
     def telemetry(self) -> ActuatorTelemetry:
-        return ActuatorTelemetry(position_mm=self.reading(), target_sent_mm=self.sent)
+        return ActuatorTelemetry(position_mm=self.reading(), target_sent_mm=self.sent, goal_mm=self.goal)
 
     def set_target_mm(self, target_mm: float, speed_share: float = 1.0) -> None:
         if not 0.0 < speed_share <= 1.0:

@@ -14,7 +14,7 @@ from graderd.drivers.dynamixel.calibration import Calibration
 from graderd.drivers.dynamixel.codec import StatusError
 from graderd.drivers.dynamixel.connection import ServoLink, condition_of
 from graderd.drivers.dynamixel.device import ATTEMPTS_N, Ph54Device
-from graderd.drivers.dynamixel.observer import MOTION_FAULTS, ServoObserver
+from graderd.drivers.dynamixel.observer import SUPPLY_FAULTS, ServoObserver
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceError, DeviceLostError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
@@ -50,6 +50,11 @@ class CommandSlot:
         """No command in force; ``sent_counts``: the goal that arming has left on the servo."""
         self.goal_deg, self.hold_wanted, self._braking = None, False, False
         self._sent_counts = sent_counts
+
+    @property
+    def holding(self) -> bool:
+        """Whether the last thing sent was a hold."""
+        return self._braking
 
     def expired(self, now_s: float) -> bool:
         """Whether the goal was not renewed in time."""
@@ -258,7 +263,7 @@ class ServoTask:
             condition = "corrupt_replies"
         if faults.set(condition, error.cause, self._clock.now_s()):
             log.warning("%s: %s", condition, error)
-        faults.clear(*(c for c in LINK_FAULTS if c != condition), *MOTION_FAULTS)
+        faults.clear(*(c for c in LINK_FAULTS if c != condition), *SUPPLY_FAULTS)
         self.lifecycle = Lifecycle.FAILED
         self._command.forget()
         self._link.disconnect()
@@ -316,9 +321,10 @@ class ServoTask:
             observer.count_damage(self._link.bus)
 
     def _standing_goal_deg(self) -> float | None:
-        """What the servo was last told to do; None while nothing is powered by us."""
+        """Where the servo drives the blade to; None while it is not powered by us, or was told to hold."""
         sent = self._observer.telemetry.goal_sent_deg
-        return sent.value if self.lifecycle is Lifecycle.ACTIVE and sent is not None else None
+        drives = self.lifecycle is Lifecycle.ACTIVE and not self._command.holding
+        return sent.value if drives and sent is not None else None
 
     async def _check_goals(self, device: Ph54Device) -> None:
         """Whether the watchdog still stands as it was written."""
@@ -349,7 +355,7 @@ class ServoTask:
     async def _end_active(self, device: Ph54Device, condition: str = "", detail: str = "") -> None:
         self.lifecycle = Lifecycle.STANDBY
         if condition:
-            self._observer.faults.event(condition, detail, self._clock.now_s())
+            self._observer.faults.tell(condition, detail, self._clock.now_s())
         await self._make_safe(device)
 
     async def _tolerant(self, step: Coroutine[None, None, None]) -> None:
@@ -394,5 +400,5 @@ class ServoTask:
             await self._observer.read_goals(device, attempts_n=ATTEMPTS_N)
         elif was_active:
             detail = f"a goal was refused: {error.cause}"
-            self._observer.faults.event("ram_reset", detail, self._clock.now_s())
+            self._observer.faults.tell("ram_reset", detail, self._clock.now_s())
         await self._make_safe(device)

@@ -82,12 +82,23 @@ class RotatorSettings(Settings):
     tolerance_deg: Positive = Field(0.5, description="so near the goal counts as arrived")
     max_age_s: Positive = Field(0.2, description="an older angle counts as unknown: the rotation holds")
     goal_timeout_s: Positive = Field(0.2, description="a goal not renewed for so long becomes a hold")
+    not_moving_s: Positive = Field(0.7, description="goal ahead and no movement for so long: commanded but not moving")
 
     @model_validator(mode="after")
     def _limits(self) -> RotatorSettings:
         if self.min_deg >= self.max_deg:
             raise ValueError(f"min_deg ({self.min_deg}) must be below max_deg ({self.max_deg})")
         return self
+
+    @property
+    def profile_velocity_deg_per_s(self) -> float:
+        """The driver's own profile: faster than the goal moves, so that following it is no second regulator."""
+        return PROFILE_MARGIN * self.speed_deg_per_s
+
+    @property
+    def profile_acceleration_deg_per_s2(self) -> float:
+        """See :attr:`profile_velocity_deg_per_s`; this is also how hard an ordinary stop brakes."""
+        return PROFILE_MARGIN * self.acceleration_deg_per_s2
 
 
 class Ph54Settings(RotatorSettings):
@@ -109,22 +120,11 @@ class Ph54Settings(RotatorSettings):
     watchdog_s: Positive = Field(0.2, le=2.54, description="the servo's own bus watchdog, steps of 20 ms")
     poll_hz: Positive = Field(50.0, le=200, description="telemetry reads a second")
     reply_timeout_s: Positive = Field(0.25, description="no valid reply for so long: the servo is lost")
-    not_moving_s: Positive = Field(0.7, description="goal ahead and no movement for so long: commanded but not moving")
     voltage_warn_low_v: Positive = 20.0
     voltage_warn_high_v: Positive = 30.0
     temperature_warn_c: Positive = 70.0
     torque_at_disarm: Literal["off", "on"] = "off"
     torque_at_exit: Literal["off", "on"] = "off"
-
-    @property
-    def profile_velocity_deg_per_s(self) -> float:
-        """The servo's own profile: faster than the goal moves, so that following it is no second regulator."""
-        return PROFILE_MARGIN * self.speed_deg_per_s
-
-    @property
-    def profile_acceleration_deg_per_s2(self) -> float:
-        """See :attr:`profile_velocity_deg_per_s`; this is also how hard an ordinary stop brakes."""
-        return PROFILE_MARGIN * self.acceleration_deg_per_s2
 
 
 class PluginRotatorSettings(RotatorSettings):

@@ -10,6 +10,7 @@ from typing import Protocol
 
 from graderd.config import Config
 from graderd.core import commands as cmd
+from graderd.core.plausibility import motion_figures
 from graderd.core.soil import SoilObservation
 from graderd.core.tick import AxisSensed, AxisTick, Controller, Sensed, Tick, TickSettings
 from graderd.hal.clock import Clock
@@ -43,8 +44,10 @@ class Eyes(Protocol):
 
 def tick_settings(config: Config) -> TickSettings:
     """What the tick goes by, out of the configuration."""
+    figures = config.figures()
     return TickSettings(
-        figures=config.figures(),
+        figures=figures,
+        motion=motion_figures(config.rotation, figures),
         machine=config.machine,
         rule=config.rule,
         gate=config.gate,

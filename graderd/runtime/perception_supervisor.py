@@ -21,7 +21,7 @@ from graderd.core.soil import SoilObservation
 from graderd.core.status import CameraStatus
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError
-from graderd.hal.fault import DeviceFault
+from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
@@ -80,9 +80,10 @@ class PerceptionSupervisor:
         self._last_word_s = clock.now_s()
         self._no_frame_since_s = clock.now_s()
         self._opened_s = clock.now_s()
-        self._restarted_s: float | None = None
         self._killed_hung = False
-        self._nonsense: tuple[str, float] | None = None
+        self._picture_faults = PresentFaults("camera")
+        self._worker_faults = PresentFaults("camera")
+        self._nonsense = PresentFaults("daemon")
         self._opens_without_frame_n = 0
         self._restarts_n = 0
         self._frame_times: deque[float] = deque(maxlen=30)
@@ -136,24 +137,19 @@ class PerceptionSupervisor:
     def faults(self) -> tuple[DeviceFault, ...]:
         """What is wrong with camera, worker and picture now."""
         now_s = self._clock.now_s()
-        found = []
+        seen: dict[str, str] = {}
         if self._is_stale():
             condition, detail = "stale", f"no frame for {now_s - self._no_frame_since_s:.1f} s"
             if self._problem is not None and self._problem.final:
                 condition, detail = self._problem.condition, self._problem.message
-            found.append(DeviceFault("camera", condition, detail, self._no_frame_since_s))
+            seen[condition] = detail
         elif self._newest is not None:
-            found += [DeviceFault("camera", f.condition, f.detail, self._newest.capture_s) for f in self._newest.faults]
-        if self._restarted_s is not None and now_s - self._restarted_s < RESTART_SHOWN_S:
-            condition = "worker_hung" if self._killed_hung else "worker_restarted"
-            found.append(DeviceFault("camera", condition, f"restart {self._restarts_n}", self._restarted_s))
-        if self._nonsense is not None and now_s - self._nonsense[1] < RESTART_SHOWN_S:
-            found.append(DeviceFault("daemon", "perception_nonsense", *self._nonsense))
+            seen |= {fault.condition: fault.detail for fault in self._newest.faults}
         if self._opened is not None and self._opened.not_kept:
-            found.append(
-                DeviceFault("camera", "settings_not_kept", "; ".join(self._opened.not_kept), self._last_word_s)
-            )
-        return tuple(found)
+            seen["settings_not_kept"] = "; ".join(self._opened.not_kept)
+        self._picture_faults.keep_only(seen, now_s)
+        books = (self._picture_faults, self._worker_faults, self._nonsense)
+        return tuple(fault for book in books for fault in book.present(now_s))
 
     def _is_stale(self) -> bool:
         return self._clock.now_s() - self._no_frame_since_s > self._camera.stale_s
@@ -205,7 +201,8 @@ class PerceptionSupervisor:
                 await self._one_child()
                 self._restarts_n += 1
                 self._opens_without_frame_n += 1
-                self._restarted_s = self._clock.now_s()
+                restart = "worker_hung" if self._killed_hung else "worker_restarted"
+                self._worker_faults.tell(restart, f"restart {self._restarts_n}", self._clock.now_s(), RESTART_SHOWN_S)
                 pause_s = self._back_off_s[min(self._opens_without_frame_n, len(self._back_off_s)) - 1]
                 log.warning("perception worker ended (restart %d in %.1f s)", self._restarts_n, pause_s)
                 await asyncio.sleep(pause_s)
@@ -258,7 +255,7 @@ class PerceptionSupervisor:
             return self._take(message)
         except ValueError as error:  # pydantic's ValidationError is one
             detail = str(error).splitlines()[0]
-            self._nonsense = (detail, self._clock.now_s())
+            self._nonsense.tell("perception_nonsense", detail, self._clock.now_s(), RESTART_SHOWN_S)
             log.warning("perception worker sent what cannot be true (%s): killing it", detail)
             return False
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from graderd.config import Config
 from graderd.core.status import Status
-from graderd.hal.fault import DeviceFault
+from graderd.hal.fault import DeviceFault, PresentFaults
 
 WRITE_EVERY_S = 0.5
 QUEUE_N = 2000
@@ -36,8 +36,7 @@ class Recorder:
         self._settings = config.recording
         self._queue: deque[str] = deque(maxlen=QUEUE_N)
         self._due_s = 0.0
-        self._problem: tuple[str, str] | None = None
-        self._problem_s = 0.0
+        self._faults = PresentFaults("daemon")  # written by the writer's thread
         self._now_s = 0.0
         self._path: Path | None = None
 
@@ -55,10 +54,7 @@ class Recorder:
 
     def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """Why nothing is written now."""
-        if self._problem is None or now_s - self._problem_s > FAULT_SHOWN_S:
-            return ()
-        condition, detail = self._problem
-        return (DeviceFault("daemon", condition, detail, self._problem_s),)
+        return self._faults.present(now_s)
 
     async def run(self) -> None:
         """Write until cancelled; the last lines are written on the way out."""
@@ -115,6 +111,6 @@ class Recorder:
             oldest.unlink()
 
     def _tell(self, condition: str, detail: str) -> None:
-        if self._problem is None or self._problem[0] != condition:
+        if self._faults.tell(condition, detail, self._now_s, FAULT_SHOWN_S):
             log.warning("recording: %s", detail)
-        self._problem, self._problem_s = (condition, detail), self._now_s
+        self._faults.clear(*({"disk_full", "recorder_failed"} - {condition}))

@@ -121,6 +121,7 @@ class ValveRotator:
         return RotatorTelemetry(
             angle_deg=self._angle,
             velocity_deg_per_s=self._velocity,
+            goal_deg=self._goal.value if self._goal is not None else None,
             goal_sent_deg=self._sent,
             counters={"feedback_n": self._heard_n},
         )

@@ -169,7 +169,8 @@ async def test_a_stale_axis_holds_and_the_others_go_on(bench: Bench) -> None:
 
 async def test_arming_is_refused_with_the_list_of_what_is_unmet(bench: Bench) -> None:
     bench.machine.tilt.lifecycle = Lifecycle.FAILED
-    bench.machine.rotation.position = 75.0
+    bench.machine.clock.advance(1.0)
+    bench.machine.rotation.position = 75.0  # turned by hand while nobody looked
     reply = await bench.do(cmd.Arm(client="t"))
     assert not reply.accepted
     assert "tilt: failed" in reply.message
@@ -243,3 +244,75 @@ async def test_a_flood_of_commands_is_worked_off_in_portions(bench: Bench) -> No
     assert sum(task.done() for task in tasks) == 32
     await bench.ticks(3)
     assert all(task.done() for task in tasks)
+
+
+async def moving(bench: Bench, speeds: dict[str, float], until_mode: Mode, most_n: int = 100) -> dict[str, float]:
+    """Push axes along until the mode is reached; how far each went."""
+    axes = {name: bench.machine.devices.all()[name] for name in speeds}
+    start = {name: axis.position for name, axis in axes.items()}  # type: ignore[union-attr]
+    for _ in range(most_n):
+        for name, axis in axes.items():
+            axis.position += speeds[name] * TICK_S  # type: ignore[union-attr]
+        await bench.ticks()
+        if bench.loop.tick.state.mode is until_mode:
+            return {name: abs(axis.position - start[name]) for name, axis in axes.items()}  # type: ignore[union-attr]
+    raise AssertionError(f"still {bench.loop.tick.state.mode}: {bench.loop.tick.faults}")
+
+
+@pytest.mark.parametrize("speed_deg_per_s", [0.4, 30.0])
+async def test_a_blade_that_turns_uncommanded_stops_the_machine(bench: Bench, speed_deg_per_s: float) -> None:
+    await bench.arm()
+    await bench.ticks(100)
+    went = await moving(bench, {"rotation": speed_deg_per_s}, Mode.STOPPED)
+    assert went["rotation"] <= 0.5 + 2 * TICK_S * speed_deg_per_s
+    assert bench.machine.rotation.held_n > 0
+    assert "rotation.moving_uncommanded" in bench.loop.tick.state.reason
+
+
+async def test_an_actuator_that_moves_uncommanded_is_disarmed_in_the_tick_that_reads_it(bench: Bench) -> None:
+    await bench.arm()
+    await bench.ticks(100)
+    went = await moving(bench, {"tilt": -20.0}, Mode.DISARMED)
+    assert went["tilt"] <= 2.0 + 20.0 * TICK_S
+    assert bench.loop.tick.faults[0].name == "tilt.uncommanded_motion"
+    await bench.ticks(2)
+    assert bench.machine.tilt.lifecycle is Lifecycle.STANDBY
+    await bench.ticks(60)
+    (fault,) = bench.loop.tick.faults
+    assert not fault.present, "over; the catalogue's latch keeps it until armed again"
+    await bench.arm()
+    assert bench.loop.tick.faults == ()
+
+
+async def test_a_stuck_blade_holds_until_armed_again(bench: Bench) -> None:
+    await bench.arm()
+    bench.machine.rotation.stuck = True
+    await bench.do(cmd.Auto(client="t"))
+    await bench.ticks(150, Zone.LEFT, share_left=0.9, share_center=0.1)
+    (fault,) = bench.loop.tick.faults
+    assert fault.name == "rotation.not_moving"
+    assert "no movement for 0.7" in fault.detail
+    bench.machine.log.clear()
+    bench.machine.rotation.stuck = False
+    await bench.ticks(150, Zone.LEFT, share_left=0.9, share_center=0.1)
+    assert not any("rotation goal" in line for line in bench.machine.log)
+
+
+async def test_a_stuck_lift_is_disarmed(bench: Bench) -> None:
+    await bench.arm()
+    bench.machine.lift_left.stuck = bench.machine.lift_right.stuck = True
+    await bench.do(cmd.Jog(axis="lift", value=150.0, relative=False, client="t"))
+    for _ in range(12):
+        await bench.ticks(4)
+        await bench.do(cmd.Renew(client="t"))
+    assert bench.loop.tick.state.mode is Mode.DISARMED
+    assert "not_moving" in bench.loop.tick.state.reason
+
+
+async def test_a_late_tick_is_told_for_a_second_and_a_long_one_beside_it(bench: Bench) -> None:
+    for late_s in (0.7, 0.15):
+        bench.loop.turn(late_s)
+    await bench.ticks(2)
+    assert {f.name for f in bench.loop.tick.faults} == {"daemon.loop_blocked", "daemon.tick_overrun"}
+    await bench.ticks(50)
+    assert bench.loop.tick.faults == ()

@@ -178,7 +178,7 @@ SERVO = (
         needs="rotation", detect_s=1.2, before_arm=put_back, own_motion=ROTATION,
     ),
     _servo(
-        "runaway", "an outer torque turns the blade", "moving_uncommanded wrong_way",
+        "runaway", "an outer torque turns the blade", "moving_uncommanded wrong_way overspeed",
         on_bare_ground(servo("push", torque_nm=55.0)),
         detect_s=2.5, before_arm=put_back, own_motion=ROTATION,
     ),
