@@ -19,6 +19,7 @@ from graderd.api.problem import Problem, ProblemError, problem_of_validation
 from graderd.api.settings import ApiLimits
 from graderd.core.commands import AnyCommand, Command, Jog, Preset, Release, Reply, Stop
 from graderd.core.status import Status
+from graderd.hal.text import printable
 
 COMMAND: TypeAdapter[Command] = TypeAdapter(AnyCommand)
 MALFORMED_PAUSE_S = 0.1
@@ -41,7 +42,7 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
     @router.websocket("/jog")
     async def jog(socket: WebSocket, client: Annotated[str, Query(max_length=60)] = "jog") -> None:
         await socket.accept()
-        session = _JogSession(port, limits, f"{client}#{next(numbers)}")
+        session = _JogSession(port, limits, f"{printable(client)}#{next(numbers)}")
         try:
             await _until_closed(socket, session.run(socket), closing)
         finally:

@@ -50,6 +50,7 @@ MAX_LINE_BYTES = 8 * 1024 * 1024
 MAX_UNSENT_BYTES = 64 * 1024
 
 log = logging.getLogger(__name__)
+_FIELDS = {"device": "camera"}
 
 
 class PerceptionSupervisor:
@@ -207,7 +208,7 @@ class PerceptionSupervisor:
                 self._opens_without_frame_n += 1
                 self._restarted_s = self._clock.now_s()
                 pause_s = self._back_off_s[min(self._opens_without_frame_n, len(self._back_off_s)) - 1]
-                log.warning("perception worker ended (restart %d in %.1f s)", self._restarts_n, pause_s)
+                log.warning("perception worker ended (restart %d in %.1f s)", self._restarts_n, pause_s, extra=_FIELDS)
                 await asyncio.sleep(pause_s)
         finally:
             await self._kill()
@@ -245,10 +246,10 @@ class PerceptionSupervisor:
                 line = await lines.readline()
         except TimeoutError:
             self._killed_hung = True
-            log.warning("perception worker said nothing for %.1f s: killing it", self._camera.restart_s)
+            log.warning("perception worker said nothing for %.1f s: killing it", self._camera.restart_s, extra=_FIELDS)
             return False
         except ValueError:
-            log.warning("perception worker sent an overlong line: killing it")
+            log.warning("perception worker sent an overlong line: killing it", extra=_FIELDS)
             return False
         if not line:
             return False
@@ -259,7 +260,7 @@ class PerceptionSupervisor:
         except ValueError as error:  # pydantic's ValidationError is one
             detail = str(error).splitlines()[0]
             self._nonsense = (detail, self._clock.now_s())
-            log.warning("perception worker sent what cannot be true (%s): killing it", detail)
+            log.warning("perception worker sent what cannot be true (%s): killing it", detail, extra=_FIELDS)
             return False
 
     def _take(self, message: Opened | Observed | CameraProblem | Preview | Saved) -> bool:
@@ -275,10 +276,9 @@ class PerceptionSupervisor:
         elif isinstance(message, Opened):
             self._opened, self._problem = message, None
             self._opened_s = self._last_word_s
-            log.info("camera open: %s", message.description)
+            log.info("camera open: %s", message.description, extra=_FIELDS)
         elif isinstance(message, CameraProblem):
-            if self._problem is None or self._problem.message != message.message:
-                log.warning("camera: %s", message.message)
+            log.warning("camera: %s", message.message, extra={**_FIELDS, "fault": f"camera.{message.condition}"})
             self._problem = message
             # Alive but without frames for too long: the ladder goes on all the same. The time a child took to start
             # does not count against it, or none that starts slowly would ever get to its first frame.
