@@ -13,11 +13,12 @@ from pydantic import TypeAdapter, ValidationError
 from starlette.websockets import WebSocketDisconnect
 
 from graderd.api.http_routes import StatusTexts, obey
-from graderd.api.limiter import Closing
+from graderd.api.limiter import Closing, Pace, stop_pace
 from graderd.api.port import DaemonPort
 from graderd.api.problem import Problem, ProblemError, problem_of_validation
 from graderd.api.settings import ApiLimits
 from graderd.core.commands import AnyCommand, Command, Jog, Preset, Release, Reply, Stop
+from graderd.core.machine import Mode
 from graderd.core.status import Status
 from graderd.hal.text import printable
 
@@ -33,6 +34,7 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
     """The WebSockets over ``port``; ``closing`` ends them."""
     router = APIRouter(prefix="/v1")
     numbers = itertools.count(1)
+    stops = stop_pace(limits)
 
     @router.websocket("/stream")
     async def stream(socket: WebSocket, rate_hz: Annotated[float, Query(gt=0, le=1000)] = limits.stream_max_hz) -> None:
@@ -42,7 +44,7 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
     @router.websocket("/jog")
     async def jog(socket: WebSocket, client: Annotated[str, Query(max_length=60)] = "jog") -> None:
         await socket.accept()
-        session = _JogSession(port, limits, f"{printable(client)}#{next(numbers)}")
+        session = _JogSession(port, limits, stops, f"{printable(client)}#{next(numbers)}")
         try:
             await _until_closed(socket, session.run(socket), closing)
         finally:
@@ -82,9 +84,10 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
 class _JogSession:
     """One client's connection: its commands carry a name nobody else has, so its lease is its own."""
 
-    def __init__(self, port: DaemonPort, limits: ApiLimits, client: str) -> None:
+    def __init__(self, port: DaemonPort, limits: ApiLimits, stops: Pace, client: str) -> None:
         self._port = port
         self._limits = limits
+        self._stops = stops
         self._client = client
         self._moved = False
 
@@ -116,11 +119,25 @@ class _JogSession:
             self._moved = True
         if isinstance(command, Stop | Release):
             self._moved = False
+        if isinstance(command, Stop) and (reply := await self._needless(command)):
+            return reply
         try:
             reply = await obey(self._port, command, self._limits)
         except ProblemError as error:
             return error.problem
         return reply
+
+    async def _needless(self, command: Stop) -> Reply | None:
+        """The answer to one of thousands of stops a second to a machine that the first has stopped. Only a tick takes a
+        reset, so that what the last one said still holds. A stop that finds the machine in any other mode is never
+        taken for needless, and of those to a stopped one as many are carried out as the limits say."""
+        if self._stops.take(asyncio.get_running_loop().time()):
+            return None
+        status = self._port.status()
+        if status.mode is not Mode.STOPPED:
+            return None
+        await asyncio.sleep(0)  # everything else has its turn between two of them
+        return Reply(command=command.command, accepted=True, message=f"already stopped: {status.reason}")
 
 
 async def _send_status(socket: WebSocket, port: DaemonPort, texts: StatusTexts, rate_hz: float) -> None:

@@ -16,7 +16,7 @@ QUIET_S = 600.0
 KEYS_MOST_N = 500
 BURST_N = 60
 PER_S = 1 / 60
-_NUMBERS = re.compile(r"\d+(\.\d+)?")
+_NUMBERS = re.compile(r"0x[0-9a-f]+|\d+(\.\d+)?")
 
 
 @dataclass(slots=True)
