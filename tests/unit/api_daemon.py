@@ -304,3 +304,30 @@ async def serving(
         for task in reversed(tasks):
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
+
+
+@dataclass
+class Hold:
+    """``longest_s``: what was computed between two of our own turns in the event loop, the longest of them."""
+
+    longest_s: float = 0.0
+
+
+@asynccontextmanager
+async def longest_hold() -> AsyncIterator[Hold]:
+    """How long the event loop keeps a task waiting that sleeps for a tick, in computing time of this thread: waiting
+    for a processor that others have is not counted."""
+    hold = Hold()
+
+    async def look() -> None:
+        while True:
+            before_s = time.thread_time()
+            await asyncio.sleep(TICK_S)
+            hold.longest_s = max(hold.longest_s, time.thread_time() - before_s)
+
+    looking = asyncio.create_task(look(), name="longest hold")
+    try:
+        yield hold
+    finally:
+        looking.cancel()
+        await asyncio.gather(looking, return_exceptions=True)

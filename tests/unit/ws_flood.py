@@ -1,13 +1,16 @@
 """Floods one WebSocket, as a process of its own: ``python -m tests.unit.ws_flood TARGET PATH KIND N SECONDS``.
 
 TARGET: a unix socket's path, or HOST:PORT:TOKEN. KIND ``stop`` or ``ping``: N such frames, written as fast as the
-daemon takes them. Nothing is read, then after SECONDS the process ends without a word.
+daemon takes them. Answers to stops are read and thrown away, those to pings never read. After SECONDS the process ends
+without a word.
 """
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import sys
+import threading
 import time
 
 MASK = b"\x01\x02\x03\x04"
@@ -30,6 +33,13 @@ def connected(target: str) -> tuple[socket.socket, str]:
     return socket.create_connection((host, int(port))), f"Authorization: Bearer {token}\r\n"
 
 
+def read_all(connection: socket.socket) -> None:
+    """Until the other side is gone."""
+    with contextlib.suppress(OSError):
+        while connection.recv(65_536):
+            pass
+
+
 def main() -> None:
     target, path, kind, frames_n, seconds = sys.argv[1:]
     connection, header = connected(target)
@@ -42,6 +52,8 @@ def main() -> None:
     if not head.startswith(b"HTTP/1.1 101"):
         sys.exit(head.decode("latin-1"))
     connection.settimeout(float(seconds))
+    if kind == "stop":
+        threading.Thread(target=read_all, args=(connection,), daemon=True).start()
     one = frame(1, STOP) if kind == "stop" else frame(9, b"")
     try:
         connection.sendall(one * int(frames_n))
