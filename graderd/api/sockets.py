@@ -133,10 +133,10 @@ class _JogSession:
         taken for needless, and of those to a stopped one as many are carried out as the limits say."""
         if self._stops.take(asyncio.get_running_loop().time()):
             return None
+        await asyncio.sleep(0)  # everything else has its turn between two of them
         status = self._port.status()
         if status.mode is not Mode.STOPPED:
             return None
-        await asyncio.sleep(0)  # everything else has its turn between two of them
         return Reply(command=command.command, accepted=True, message=f"already stopped: {status.reason}")
 
 

@@ -88,7 +88,9 @@ class FakeDaemon:
 
     async def command(self, command: cmd.Command) -> cmd.Reply:
         if isinstance(command, cmd.Stop) and not self.frozen:
-            return self._step([command])[0]
+            (reply,) = self._step([command])
+            self._status = self._make_status(self._clock.now_s())
+            return reply
         future: asyncio.Future[cmd.Reply] = asyncio.get_running_loop().create_future()
         self.waiting.append((command, future))
         return await future

@@ -178,7 +178,8 @@ class Daemon:
     def _on_signal(self, number: int) -> None:
         name = signal.Signals(number).name
         self._notifier.stopping()
-        self._loop.end(f"{name} received")
+        if not self._loop.end(f"{name} received"):
+            self._recorder.expect_stop()
         self._ended.set()
 
     async def _close_devices(self) -> None:
