@@ -6,10 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from graderd.hal.text import printable
-
 from graderd.core.axes import JogName
-
+from graderd.hal.text import printable
 
 ClientText = Annotated[str, AfterValidator(printable)]
 """What a client writes and others read: in status, log, journal, records and on their terminals. Made printable where

@@ -160,7 +160,7 @@ async def _finished(task: asyncio.Task[None] | None) -> None:
 
 
 async def open_devices(devices: Devices) -> None:
-    """Open the bus, then all axes side by side; a failure is told and tried again; the log repeats it ever more rarely."""
+    """Open the bus, then all axes side by side. What fails is told and tried again; the log repeats it more rarely."""
     async with asyncio.TaskGroup() as group:
         group.create_task(_keep_trying("rotation", devices.rotation.open, devices.problems), name="open-rotation")
         group.create_task(_open_bus(devices), name="open-can")

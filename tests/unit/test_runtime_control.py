@@ -123,7 +123,7 @@ async def test_an_ordinary_restart_keeps_the_last_stop(bench: Bench, tmp_path: P
     bench.loop.stop_now(cmd.Stop(reason="dog on the site", client="cab"))
     await bench.do(cmd.Reset(client="cab"))
     assert bench.loop.end("SIGTERM received") is False
-    assert bench.loop.state.mode is Mode.STOPPED
+    assert bench.loop.tick.state.mode is Mode.STOPPED
     last = StateFile(str(tmp_path)).load()
     assert last is not None
     assert last.reason == "dog on the site (by cab)"
