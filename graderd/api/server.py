@@ -384,7 +384,8 @@ def _bounded_http(limits: ApiLimits, guard: TcpGuard | None) -> type[H11Protocol
             body = problem.model_dump_json().encode()
             length = str(len(body))
             headers = [("content-type", "application/json"), ("content-length", length), ("connection", "close")]
-            for event in (h11.Response(status_code=status_code, headers=headers), h11.Data(data=body)):
+            response = h11.Response(status_code=status_code, headers=headers)
+            for event in (response, h11.Data(data=body), h11.EndOfMessage()):
                 self.transport.write(self.conn.send(event) or b"")
             if self.transport.can_write_eof():
                 self.transport.write_eof()

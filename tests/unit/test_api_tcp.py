@@ -19,7 +19,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
 from graderd.api.app import make_app
-from graderd.api.server import SocketError, serve
+from graderd.api.server import LINGER_S, SocketError, serve
 from graderd.api.settings import TcpSettings
 from graderd.api.tcp_guard import load_or_make_token
 from graderd.core.machine import Mode
@@ -213,6 +213,27 @@ async def test_nothing_of_a_strangers_request_reaches_the_application(
     assert answer.startswith(b"HTTP/1.1 401" if host == "localhost" else b"HTTP/1.1 403"), answer[:200]
     assert answer.count(b"HTTP/1.1") == 1
     assert reached == []
+    assert caplog.records == []
+
+
+async def test_a_stranger_who_hangs_on_is_let_go_and_does_not_keep_the_daemon(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    tcp = tcp_settings(tmp_path)
+    ready = asyncio.Event()
+    server = asyncio.create_task(serve(make_app(FakeDaemon()), tmp_path / "api.sock", tcp=tcp, ready=ready))
+    await within(5, ready.wait())
+    hanging = [await asyncio.open_connection("127.0.0.1", tcp.port_n) for _ in range(2)]
+    for reader, writer in hanging:
+        writer.write(head(tcp.port_n, f"X-Long: {'x' * 9_000}"))
+        assert (await within(5, reader.readuntil(b"\r\n\r\n"))).startswith(b"HTTP/1.1 431")
+    first, _ = hanging[0]
+    assert await within(2 * LINGER_S + 5, first.read()) != b""
+    server.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await within(3, server)
+    for _, writer in hanging:
+        writer.close()
     assert caplog.records == []
 
 
