@@ -46,6 +46,10 @@ BACK_OFF_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 RESTART_SHOWN_S = 5.0
 FUTURE_S = 0.1
 """Both processes read one clock; a frame further ahead of it than this is none."""
+COMPLAINTS_S = 0.5
+COMPLAINTS_EVERY_S = 0.01
+COMPLAINTS_BYTES = 65_536
+COMPLAINTS_N = 20
 MAX_LINE_BYTES = 8 * 1024 * 1024
 MAX_UNSENT_BYTES = 64 * 1024
 
@@ -219,7 +223,11 @@ class PerceptionSupervisor:
         self._last_word_s = self._clock.now_s() + self._start_grace_s - self._camera.restart_s
         starting = asyncio.ensure_future(
             asyncio.create_subprocess_exec(
-                *self._command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=MAX_LINE_BYTES
+                *self._command,
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.PIPE,
+                limit=MAX_LINE_BYTES,
             )
         )
         try:
@@ -232,11 +240,18 @@ class PerceptionSupervisor:
         start = self._start.model_copy(update={"reset_first": reset_first})
         self._process.stdin.write(start.model_dump_json().encode() + b"\n")
         self._killed_hung = False
+        assert self._process.stderr is not None
+        complaints = asyncio.create_task(_log_complaints(self._process.stderr), name="perception-complaints")
         try:
             while await self._one_line(self._process.stdout):
                 pass
         finally:
-            await self._kill()
+            try:
+                await self._kill()
+                # Dead, its pipe ends by itself, unless a process that it left behind holds it.
+                await asyncio.wait((complaints,), timeout=COMPLAINTS_S)
+            finally:
+                complaints.cancel()
 
     async def _one_line(self, lines: asyncio.StreamReader) -> bool:
         """Handle the child's next line. False: it ended, spoke nonsense or has been silent for too long."""
@@ -304,3 +319,13 @@ class PerceptionSupervisor:
         # Forgotten only when it is reaped: cancelled while waiting here, run() comes here again.
         await process.wait()
         self._process = None
+
+
+async def _log_complaints(stream: asyncio.StreamReader) -> None:
+    """What the child and the libraries in it print on standard error, through our log: a child that fails at every
+    start would else fill the journal past all its limits. Of a torrent, each piece's first and last lines are told."""
+    while data := await stream.read(COMPLAINTS_BYTES):
+        lines = [line for line in data.decode("utf-8", "replace").splitlines() if line.strip()]
+        for line in lines if len(lines) <= 2 * COMPLAINTS_N else lines[:COMPLAINTS_N] + lines[-COMPLAINTS_N:]:
+            log.warning("perception worker: %s", line, extra=_FIELDS)
+        await asyncio.sleep(COMPLAINTS_EVERY_S)
