@@ -119,25 +119,20 @@ class _JogSession:
             self._moved = True
         if isinstance(command, Stop | Release):
             self._moved = False
-        if isinstance(command, Stop) and (reply := await self._needless(command)):
-            return reply
+        if isinstance(command, Stop):
+            await self._turn_of_stop()
         try:
             reply = await obey(self._port, command, self._limits)
         except ProblemError as error:
             return error.problem
         return reply
 
-    async def _needless(self, command: Stop) -> Reply | None:
-        """The answer to one of thousands of stops a second to a machine that the first has stopped. Only a tick takes a
-        reset, so that what the last one said still holds. A stop that finds the machine in any other mode is never
-        taken for needless, and of those to a stopped one as many are carried out as the limits say."""
-        if self._stops.take(asyncio.get_running_loop().time()):
-            return None
-        await asyncio.sleep(0)  # everything else has its turn between two of them
-        status = self._port.status()
-        if status.mode is not Mode.STOPPED:
-            return None
-        return Reply(command=command.command, accepted=True, message=f"already stopped: {status.reason}")
+    async def _turn_of_stop(self) -> None:
+        """Wait for the turn of one of thousands of stops a second to a machine that the first has stopped. Each is
+        carried out and counted (a reset names the last), and one that finds the machine in any other mode at once."""
+        now_s = asyncio.get_running_loop().time()
+        if not self._stops.take(now_s) and self._port.status().mode is Mode.STOPPED:
+            await asyncio.sleep(self._stops.delay_s(now_s))
 
 
 async def _send_status(socket: WebSocket, port: DaemonPort, texts: StatusTexts, rate_hz: float) -> None:

@@ -266,10 +266,10 @@ async def test_30_000_stops_on_the_jog_socket(tmp_path: Path, wire: str, caplog:
                 *(sys.executable, "-m", "tests.unit.ws_flood", target, "/v1/jog", "stop", "30000", "4")
             )
             await daemon.until_mode(Mode.STOPPED)
-            # Others are served meanwhile: a reset holds until the next of the stops, which is carried out again.
+            # Others are served meanwhile. The reset names a stop that is no longer the last: it is refused.
             async with httpx.AsyncClient(transport=httpx.AsyncHTTPTransport(uds=str(path))) as client:
-                answer = await client.post("http://localhost/v1/commands", json={"command": "reset"})
-            assert answer.status_code == 200
+                answer = await client.post("http://localhost/v1/commands", json={"command": "reset", "stop_n": 1})
+            assert answer.status_code == 409
             assert await within(30, flood.wait()) == 0
             await daemon.until_mode(Mode.STOPPED)
     assert hold.longest_s < HOLD_S

@@ -121,7 +121,7 @@ async def test_stop_holds_every_axis_before_it_returns_and_latches(bench: Bench,
 
 async def test_an_ordinary_restart_keeps_the_last_stop(bench: Bench, tmp_path: Path) -> None:
     bench.loop.stop_now(cmd.Stop(reason="dog on the site", client="cab"))
-    await bench.do(cmd.Reset(client="cab"))
+    assert (await bench.do(cmd.Reset(client="cab", stop_n=1))).accepted
     assert bench.loop.end("SIGTERM received") is False
     assert bench.loop.tick.state.mode is Mode.STOPPED
     last = StateFile(str(tmp_path)).load()
