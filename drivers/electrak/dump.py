@@ -31,6 +31,7 @@ from graderd.drivers.j1939.transport import Message, Transport
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError, DeviceLostError, ProtocolError
 from graderd.hal.settings import CanSettings
+from graderd.hal.text import printable
 
 _THOMSON_ADDRESSES: Final = range(19, 43)
 """HD from 19, MD from 27, and a third family seen from 35 on with the same messages."""
@@ -278,7 +279,7 @@ def text_of(decoded: DecodedFrame) -> str:
         return f"{head}  {decoded['data']}"
     route = f"{decoded['source']:3d} > {decoded['destination']:3d}"
     signals = " ".join(f"{key}={value}" for key, value in decoded["signals"].items())
-    return f"{head}  {route}  {decoded['name']:<18} {signals or decoded['data']}"
+    return printable(f"{head}  {route}  {decoded['name']:<18} {signals or decoded['data']}")  # a unit's own words
 
 
 def dump(frames: Iterator[Timed], out: TextIO, *, as_json: bool) -> None:

@@ -64,6 +64,7 @@ class LinkUser(Protocol):
 
 
 _log = logging.getLogger(__name__)
+_FIELDS = {"device": "can"}
 
 CONTROL_PERIOD_S: Final = 0.1
 _POLL_S: Final = 0.02
@@ -359,10 +360,12 @@ class CanLink:
                 try:
                     await self._open_port()
                     self.counters.reopened_n += 1
+                    _log.info("%s: open again", self.where, extra=_FIELDS)
                 except DeviceError as error:
+                    _log.warning("%s: not open again: %s", self.where, error, extra=_FIELDS)
                     self._health.on_open_failed(error, self._clock.now_s())
                 except Exception:  # a bug in here must not end the search for the bus
-                    _log.exception("%s: opening failed in an unexpected way; will try again", self.where)
+                    _log.exception("%s: opening failed in an unexpected way; will try again", self.where, extra=_FIELDS)
 
     async def _open_port(self) -> None:
         self._lost.clear()
@@ -379,7 +382,8 @@ class CanLink:
 
     def _on_lost(self, error: PortLostError) -> None:
         now_s = self._clock.now_s()
-        _log.warning("%s: lost (%s): %s", self.where, error.condition, error.detail)
+        fields = {**_FIELDS, "fault": f"can.{error.condition}"}
+        _log.warning("%s: lost (%s): %s", self.where, error.condition, error.detail, extra=fields)
         self.counters.lost_n += 1
         self._health.on_lost(error.condition, error.detail, now_s)
         self._drop_port()

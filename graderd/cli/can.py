@@ -11,6 +11,7 @@ import typer
 
 from graderd.cli.client import Daemon, daemon_of
 from graderd.cli.console import TAKES_ANYTHING, CliError, ExitCode, example, hand_over
+from graderd.hal.text import printable
 
 _MODULE = "graderd.drivers.electrak.dump"
 
@@ -69,7 +70,7 @@ def through(daemon: Daemon, options: list[str]) -> None:
             while decoder.poll() is None:
                 text = str(stream.recv())
                 if text.startswith("#"):
-                    typer.echo(text.partition("\n")[0], err=True)
+                    typer.echo(printable(text.partition("\n")[0]), err=True)
                 decoder.stdin.write(text.encode())
         except (BrokenPipeError, KeyboardInterrupt):
             return  # nobody reads on: that is how a live view ends

@@ -9,6 +9,7 @@ import typer
 
 from graderd.cli.client import Daemon, client_name, daemon_of
 from graderd.cli.console import CliError, Json, example, print_json, print_table, print_text
+from graderd.hal.text import printable
 
 ARMING_S = 8.0
 POLL_S = 0.05
@@ -93,7 +94,7 @@ def _tell(reply: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print_json(reply)
     else:
-        print_text(reply["message"])
+        print_text(printable(reply["message"]))
 
 
 def _after_arming(daemon: Daemon) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -58,10 +57,9 @@ def _guard(app: typer.Typer) -> None:
         ended, whatever it ended of.
         """
         from graderd.runtime.app import run_guard
+        from graderd.runtime.app.journal import set_up_logging
 
-        log = logging.getLogger("graderd")
-        log.addHandler(logging.StreamHandler())
-        log.setLevel(logging.INFO)
+        set_up_logging(as_json=False)
         status = run_guard(config)
         if json:
             print_json({"safe": status == 0})

@@ -21,6 +21,7 @@ from graderd.cli.console import (
     print_text,
     rich_table,
 )
+from graderd.hal.text import printable
 
 THERMAL_SHOWN = 0.05
 Section = tuple[str, Row, list[Row]]
@@ -81,7 +82,7 @@ def summary(state: dict[str, Any]) -> str:
     """One line: mode, reason, angle, soil, faults."""
     rotation = state["axes"].get("rotation", {})
     faults = ", ".join(fault["name"] for fault in state["faults"]) or "none"
-    return (
+    return printable(
         f"{time.strftime('%H:%M:%S')} {state['mode']} ({state['reason']}) soil {state['soil']['zone']} "
         f"rotation {_number(rotation.get('requested'), 'deg')} -> {_number(rotation.get('measured'), 'deg')} "
         f"faults {faults}"

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import json
 import logging
 import shutil
 import signal
-import sys
-import time
 from pathlib import Path
 
 from graderd.api.app import make_app
@@ -21,6 +18,8 @@ from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
 from graderd.runtime.app.backends import check_plugins
 from graderd.runtime.app.devices import build_devices, build_stop_input
+from graderd.runtime.app.hang_watch import HangWatch
+from graderd.runtime.app.journal import set_up_logging
 from graderd.runtime.app.services import build_services
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
 from graderd.runtime.control import ControlLoop
@@ -89,6 +88,7 @@ class Daemon:
         self._config = config
         self._rig = rig
         self._notifier = SystemdNotifier()
+        self._hang_watch = HangWatch()
         self._eyes = PerceptionSupervisor(
             config.camera, config.camera.calibration, config.perception, config.blade, clock
         )
@@ -115,6 +115,7 @@ class Daemon:
     def _after_tick(self) -> None:
         """Runs in the tick: nothing here may wait."""
         self._notifier.feed_watchdog()
+        self._hang_watch.ticked(self._loop.tick.now_s)
         self._port.published()
         tick = self._loop.tick
         self._recorder.take(tick.now_s, self._port.status)
@@ -154,6 +155,7 @@ class Daemon:
                 for task in tasks:
                     task.cancel()
         finally:
+            self._hang_watch.close()
             await self._close_devices()
             # Not earlier: a second signal, taken the default way, would end the process before the wires are safe.
             for number in (signal.SIGINT, signal.SIGTERM):
@@ -176,7 +178,8 @@ class Daemon:
     def _on_signal(self, number: int) -> None:
         name = signal.Signals(number).name
         self._notifier.stopping()
-        self._loop.stop_now(cmd.Stop(reason=f"{name} received"))
+        if not self._loop.end(f"{name} received"):
+            self._recorder.expect_stop()
         self._ended.set()
 
     async def _close_devices(self) -> None:
@@ -195,23 +198,6 @@ class Daemon:
         for result in await asyncio.gather(*(device.close() for device in devices), return_exceptions=True):
             if isinstance(result, Exception):
                 log.error("closing %s: %s", part, result)
-
-
-class _JsonLines(logging.Formatter):
-    def format(self, record: logging.LogRecord) -> str:
-        line = {"time": time.time(), "level": record.levelname.lower(), "event": "log", "message": record.getMessage()}
-        if record.exc_info:
-            line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line)
-
-
-def set_up_logging(as_json: bool) -> None:
-    """One line an event on stderr; the journal adds the time, a terminal gets it from us."""
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_JsonLines() if as_json else logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
-    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
-    logging.getLogger("can").setLevel(logging.ERROR)
-    logging.getLogger("uvicorn").setLevel(logging.WARNING)
 
 
 def _leaves(group: BaseExceptionGroup[DeviceError]) -> list[DeviceError]:
