@@ -55,8 +55,8 @@ def make_cli() -> typer.Typer:
         socket: Annotated[
             Path | None,
             typer.Option(
-                help="The daemon's socket. Default: $GRADERD_SOCKET, else /run/graderd/graderd.sock, else "
-                "$XDG_RUNTIME_DIR/graderd/graderd.sock.",
+                help="The daemon's socket. Default: $GRADERD_SOCKET, else what /etc/graderd/graderd.toml says, else "
+                "/run/graderd/graderd.sock, else $XDG_RUNTIME_DIR/graderd/graderd.sock.",
             ),
         ] = None,
     ) -> None:

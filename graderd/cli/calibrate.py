@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import os
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 
 DEFAULT_ANGLES_DEG = "-40,-20,0,20,40"
 LIVE_TIMEOUT_S = 120.0
+FETCH_TIMEOUT_S = 10.0
 POSE_NAMES = ("position_x_m", "position_y_m", "position_z_m", "pitch_down_deg", "yaw_deg", "roll_deg")
 BLADE_NAMES = ("x_offset_m", "length_m", "height_m")
 
@@ -85,9 +88,10 @@ def register(app: typer.Typer) -> None:
             _by_hand(path, settings, start_pose, yes, json)
             return
         _may_save(save)
-        frames = _recorded(source) if source is not None else _live(context, angles_deg, yes, json)
-        result = _solve(settings, frames, start_pose)
-        _picture(frames, result, save)
+        with TemporaryDirectory(prefix="graderd-") as room:
+            frames = _recorded(source or _live(context, Path(room), angles_deg, yes, json))
+            result = _solve(settings, frames, start_pose)
+            _picture(frames, result, save)
         if json:
             print_json(_result_object(settings, result, save))
         else:
@@ -144,8 +148,8 @@ def _recorded(source: Path) -> FrameSet:
         raise CliError(error.where, error.cause, error.remedy, ExitCode.USAGE) from None
 
 
-def _live(context: typer.Context, angles_deg: str, yes: bool, as_json: bool) -> FrameSet:
-    """Have the daemon turn the blade and take the frames; it leaves them as a frame set."""
+def _live(context: typer.Context, room: Path, angles_deg: str, yes: bool, as_json: bool) -> Path:
+    """Have the daemon turn the blade and take the frames, and fetch them into a frame set in ``room``."""
     try:
         angles = [float(part) for part in angles_deg.split(",")]
     except ValueError:
@@ -157,7 +161,20 @@ def _live(context: typer.Context, angles_deg: str, yes: bool, as_json: bool) -> 
         )
     _agree("Is the blade empty and off the ground, and is everybody clear of it? Turn it now?", yes)
     answer = daemon.service("camera.calibrate", LIVE_TIMEOUT_S, consent=True, angles_deg=angles)
-    return _recorded(Path(answer["frame_set"]))
+    folder = room / _plain(answer["frame_set"])
+    folder.mkdir()
+    for name in answer["files"]:
+        picture = folder / _plain(name)
+        content = daemon.service("camera.calibration_file", FETCH_TIMEOUT_S, file=name)["base64"]
+        picture.write_bytes(base64.b64decode(content))
+    return folder
+
+
+def _plain(name: str) -> str:
+    """A name the daemon gave, where it stays in its folder: root shall not write where the daemon says."""
+    if name != Path(name).name or name in ("", ".", ".."):
+        raise CliError("camera.calibrate", f"the daemon names a file {name!r}", "See its log")
+    return name
 
 
 def _solve(settings: Config, frames: FrameSet, start_pose: dict[str, float] | None) -> CalibrationResult:

@@ -23,7 +23,7 @@ BUS_LINES_N = 2000
 """More than a second of a full bus."""
 BUS_PAUSE_S = 0.05
 """Frames come in bundles: a message for each would cost more than the bus itself."""
-SERVICES_IN_ANY_MODE = frozenset({"rotation.verify_profile"})
+SERVICES_IN_ANY_MODE = frozenset({"rotation.verify_profile", "camera.calibration_file"})
 
 
 class Port:

@@ -21,6 +21,7 @@ from graderd.drivers.dynamixel.ph54 import Ph54Rotator
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
 from graderd.runtime.app.adapter_watch import AdapterWatch
+from graderd.runtime.app.check import problems
 from graderd.runtime.app.devices import build_devices, build_stop_input
 from graderd.runtime.app.last_run import remember
 from graderd.runtime.app.services import build_services
@@ -44,18 +45,21 @@ def run_daemon(config_path: Path | None, sim: bool, rig_dir: Path | None, as_jso
     set_up_logging(as_json)
     try:
         config = load(config_path)
+        refusals = problems(config)
     except ConfigError as error:
-        for line in error.problems:
+        refusals = error.problems
+    if refusals:
+        for line in refusals:
             log.error("%s", line)
         return 2
-    problems: list[DeviceError] = []
+    failures: list[DeviceError] = []
     try:
         asyncio.run(_main(config, config_path, sim, rig_dir))
     except* DeviceError as group:
-        problems = _leaves(group)
-    for problem in problems:
-        log.error("%s", problem)
-    return 1 if problems else 0
+        failures = _leaves(group)
+    for failure in failures:
+        log.error("%s", failure)
+    return 1 if failures else 0
 
 
 async def _main(config: Config, source: Path | None, sim: bool, rig_dir: Path | None) -> None:
