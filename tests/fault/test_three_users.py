@@ -21,7 +21,7 @@ import pytest
 from tests.unit.test_cli_offline import leaf_commands
 from tests.users import CONFIG, DAEMON, OPERATOR, ROOT, STATE, STRANGER, Machine, environment, three_users
 
-pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(600)]
 READY_S = 120.0
 POSE = "0.9,0.05,0.6,30,1,-1"
 USERS = (DAEMON, OPERATOR, STRANGER)
@@ -55,11 +55,10 @@ def configuration(machine: Machine, original: str) -> None:
 class Service:
     """The daemon as the unit starts it, on the simulated grader."""
 
-    def __init__(self, machine: Machine) -> None:
+    def __init__(self, machine: Machine, *grader: str) -> None:
         self.machine = machine
-        command = machine.command(
-            DAEMON, sys.executable, "-P", "-m", "graderd", "run", "--config", CONFIG, "--sim", "--json"
-        )
+        words = (sys.executable, "-P", "-m", "graderd", "run", "--config", CONFIG, *(grader or ("--sim",)))
+        command = machine.command(DAEMON, *words)
         self.process = subprocess.Popen(command, env=environment(DAEMON), stderr=subprocess.PIPE, text=True)
 
     def until(self, reached: Callable[[dict[str, Any]], bool], user: str = OPERATOR) -> dict[str, Any]:
@@ -91,7 +90,7 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
     """What was said, if it is one line for people."""
     assert "Traceback" not in done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
-    assert done.stderr.startswith("graderd: ")
+    assert done.stderr.startswith(("graderd: ", "rig: "))
     return done.stderr
 
 
@@ -195,16 +194,32 @@ def test_calibrating_live(machine: Machine, service: Service) -> None:
     lives(machine)
 
 
-@pytest.mark.parametrize("spoil", ["chmod 0600", "chown oper:oper", "rm"])
-def test_the_guard_acts_on_what_the_daemon_last_ran_with(machine: Machine, service: Service, spoil: str) -> None:
-    machine.must(ROOT, *spoil.split(), CONFIG)
-    if spoil.startswith("chown"):
-        machine.must(ROOT, "chmod", "600", CONFIG)
-    done = machine.graderd(DAEMON, "guard", "--config", CONFIG, "--no-such-option")
-    assert "12 motion-disable messages sent" in done.stderr
-    assert '{"failed": []}' in done.stderr
-    assert done.returncode == 0
-    assert "Traceback" not in done.stderr
+def test_the_guard_acts_on_what_the_daemon_last_ran_with(machine: Machine) -> None:
+    """After a daemon that was killed, whatever became of its configuration: the wires are in its last run's words."""
+    folder = "/run/graderd/rig"
+    rig = subprocess.Popen(
+        machine.command(DAEMON, sys.executable, "-P", "-m", "graderd", "rig", "--dir", folder),
+        env=environment(DAEMON),
+        stdout=subprocess.PIPE,
+    )
+    try:
+        machine.must(DAEMON, "sh", "-c", f"until [ -e {folder}/rig.json ]; do sleep 0.1; done")
+        service = Service(machine, "--rig-dir", folder)
+        try:
+            service.until(lambda state: state["axes"]["rotation"]["measured"] is not None)
+        finally:
+            service.process.kill()
+            service.process.communicate()
+        for spoil in (f"chmod 600 {CONFIG}", f"chown oper:oper {CONFIG}", f"echo [[[ >{CONFIG}", f"rm {CONFIG}"):
+            machine.must(ROOT, "sh", "-c", spoil)
+            done = machine.graderd(DAEMON, "guard", "--config", CONFIG, "--no-such-option")
+            assert "12 motion-disable messages sent" in done.stderr
+            assert '{"failed": []}' in done.stderr
+            assert done.returncode == 0
+            assert "Traceback" not in done.stderr
+    finally:
+        rig.terminate()
+        rig.communicate()
 
 
 def test_the_guard_of_anybody_else_says_what_it_cannot(machine: Machine) -> None:
