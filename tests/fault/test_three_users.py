@@ -57,7 +57,16 @@ class Service:
 
     def __init__(self, machine: Machine, *grader: str) -> None:
         self.machine = machine
-        words = (sys.executable, "-P", "-m", "graderd", "run", "--config", CONFIG, *(grader or ("--sim",)))
+        words: tuple[str | Path, ...] = (
+            sys.executable,
+            "-P",
+            "-m",
+            "graderd",
+            "run",
+            "--config",
+            CONFIG,
+            *(grader or ("--sim",)),
+        )
         command = machine.command(DAEMON, *words)
         self.process = subprocess.Popen(command, env=environment(DAEMON), stderr=subprocess.PIPE, text=True)
 
@@ -229,12 +238,11 @@ def test_the_guard_of_anybody_else_says_what_it_cannot(machine: Machine) -> None
     assert "Permission denied" in done.stderr
 
 
-OPEN = """
+MIGRATE = """
 import sys
 from pathlib import Path
 from graderd.config.migrate import STEPS, migrate_file, rename
-STEPS = {0: lambda d: rename(d, "servo", "rotation")}
-print(migrate_file(Path(sys.argv[1]), STEPS))
+print(migrate_file(Path(sys.argv[1]), {0: lambda document: rename(document, "servo", "rotation"), **STEPS}))
 """
 
 
@@ -250,7 +258,7 @@ def test_an_upgrade_writes_through_no_name_that_was_planted(machine: Machine) ->
     try:
         for name in names:
             machine.must(OPERATOR, "ln", "-s", victim, CONFIG.parent / name)
-        done = machine.python(ROOT, OPEN, CONFIG)
+        done = machine.python(ROOT, MIGRATE, CONFIG)
         assert done.returncode == 0, done
         assert machine.must(ROOT, "cat", victim) == "precious"
         assert not machine.must(ROOT, "find", CONFIG, "-type", "l")
@@ -259,7 +267,7 @@ def test_an_upgrade_writes_through_no_name_that_was_planted(machine: Machine) ->
         assert [machine.rights(Path(name)) for name in backups] == ["root:graderd 640"]
         machine.must(ROOT, "mv", CONFIG, "/run/real.toml")
         machine.must(OPERATOR, "ln", "-s", "/run/real.toml", CONFIG)
-        done = machine.python(ROOT, OPEN, CONFIG)
+        done = machine.python(ROOT, MIGRATE, CONFIG)
         assert "not followed" in done.stderr
         machine.must(ROOT, "rm", CONFIG)
     finally:

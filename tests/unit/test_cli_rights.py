@@ -25,7 +25,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Directories of a service that this user may not look into: ``etc``, ``run``, ``state``."""
     for name in ("etc", "run", "state"):
         (tmp_path / name).mkdir()
-    (tmp_path / "etc" / "graderd.toml").write_text("version = 1\n")
+    (tmp_path / "etc" / "graderd.toml").write_text("# of the service\n")
     (tmp_path / "run" / "graderd.sock").touch()
     monkeypatch.setattr(places, "CONFIG", tmp_path / "etc" / "graderd.toml")
     monkeypatch.setattr(places, "SOCKET", tmp_path / "run" / "graderd.sock")

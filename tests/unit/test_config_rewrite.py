@@ -17,9 +17,10 @@ import pytest
 
 from graderd.config import ConfigError, load
 from graderd.config import rewrite as module
+from graderd.config.migrate import CURRENT_VERSION
 from graderd.config.rewrite import BACKUPS_N, check_rights, merged, rewrite
 
-OLD = "# mine\nversion = 1\n[blade]\nlength_m = 1.0 # measured\n"
+OLD = f"# mine\nversion = {CURRENT_VERSION}\n[blade]\nlength_m = 1.0 # measured\n"
 
 
 @pytest.fixture
