@@ -73,10 +73,13 @@ def guard_all_the_same(arguments: list[str]) -> int:
 def _make_safe(config: Path | None, as_json: bool) -> int:
     from graderd.runtime.app import run_guard
 
-    log = logging.getLogger("graderd")
-    log.addHandler(logging.StreamHandler())
+    log, lines = logging.getLogger("graderd"), logging.StreamHandler()
+    log.addHandler(lines)
     log.setLevel(logging.INFO)
-    status = run_guard(config)
+    try:
+        status = run_guard(config)
+    finally:
+        log.removeHandler(lines)
     if as_json:
         print_json({"safe": status == 0})
     return status

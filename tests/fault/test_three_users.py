@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -57,32 +59,29 @@ class Service:
 
     def __init__(self, machine: Machine, *grader: str) -> None:
         self.machine = machine
-        words: tuple[str | Path, ...] = (
-            sys.executable,
-            "-P",
-            "-m",
-            "graderd",
-            "run",
-            "--config",
-            CONFIG,
-            *(grader or ("--sim",)),
-        )
+        words = [sys.executable, "-P", "-m", "graderd", "run", "--config", str(CONFIG), *(grader or ["--sim"])]
         command = machine.command(DAEMON, *words)
-        self.process = subprocess.Popen(command, env=environment(DAEMON), stderr=subprocess.PIPE, text=True)
+        self.log = tempfile.TemporaryFile("w+")  # noqa: SIM115  (until end)
+        self.process = subprocess.Popen(command, env=environment(DAEMON), stderr=self.log)
 
     def until(self, reached: Callable[[dict[str, Any]], bool], user: str = OPERATOR) -> dict[str, Any]:
         give_up_s = time.monotonic() + READY_S
         while True:
-            assert self.process.poll() is None, self.process.communicate()[1]
+            assert self.process.poll() is None, self._said()
             answer = self.machine.graderd(user, "status", "--json")
             state: dict[str, Any] = json.loads(answer.stdout) if answer.returncode == 0 else {}
             if state and reached(state):
                 return state
-            assert time.monotonic() < give_up_s, answer
+            assert time.monotonic() < give_up_s, (answer, self._said())
 
-    def end(self) -> None:
-        self.process.terminate()
-        self.process.communicate(timeout=30)
+    def _said(self) -> str:
+        self.log.seek(0)
+        return self.log.read()
+
+    def end(self, number: signal.Signals = signal.SIGTERM) -> None:
+        self.process.send_signal(number)
+        self.process.wait(30)
+        self.log.close()
 
 
 @pytest.fixture
@@ -209,7 +208,7 @@ def test_the_guard_acts_on_what_the_daemon_last_ran_with(machine: Machine) -> No
     rig = subprocess.Popen(
         machine.command(DAEMON, sys.executable, "-P", "-m", "graderd", "rig", "--dir", folder),
         env=environment(DAEMON),
-        stdout=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
     )
     try:
         machine.must(DAEMON, "sh", "-c", f"until [ -e {folder}/rig.json ]; do sleep 0.1; done")
@@ -217,8 +216,7 @@ def test_the_guard_acts_on_what_the_daemon_last_ran_with(machine: Machine) -> No
         try:
             service.until(lambda state: state["axes"]["rotation"]["measured"] is not None)
         finally:
-            service.process.kill()
-            service.process.communicate()
+            service.end(signal.SIGKILL)
         for spoil in (f"chmod 600 {CONFIG}", f"chown oper:oper {CONFIG}", f"echo [[[ >{CONFIG}", f"rm {CONFIG}"):
             machine.must(ROOT, "sh", "-c", spoil)
             done = machine.graderd(DAEMON, "guard", "--config", CONFIG, "--no-such-option")
@@ -228,7 +226,7 @@ def test_the_guard_acts_on_what_the_daemon_last_ran_with(machine: Machine) -> No
             assert "Traceback" not in done.stderr
     finally:
         rig.terminate()
-        rig.communicate()
+        rig.wait(30)
 
 
 def test_the_guard_of_anybody_else_says_what_it_cannot(machine: Machine) -> None:
