@@ -5,10 +5,11 @@ So the rights of the socket decide who gets them, whoever the client is and wher
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
+import tempfile
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from graderd.hal.errors import CommandRangeError
 
@@ -21,7 +22,8 @@ class CalibrationFrames:
 
     def __init__(self, configured: str = "") -> None:
         self._base = os.environ.get("STATE_DIRECTORY") or configured or None
-        self._folder: TemporaryDirectory[str] | None = None
+        self._folder: Path | None = None
+        atexit.register(self.discard)
         if self._base is not None:  # what a killed daemon left
             for left in Path(self._base).glob(f"{PREFIX}*"):
                 shutil.rmtree(left, ignore_errors=True)
@@ -35,12 +37,12 @@ class CalibrationFrames:
         self.discard()
         if self._base is not None:
             Path(self._base).mkdir(parents=True, exist_ok=True)
-        self._folder = TemporaryDirectory(prefix=PREFIX, dir=self._base, ignore_cleanup_errors=True)
-        return Path(self._folder.name)
+        self._folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=self._base))
+        return self._folder
 
     def names(self) -> list[str]:
         """The files that were not fetched yet."""
-        return sorted(os.listdir(self._folder.name)) if self._folder is not None else []
+        return sorted(os.listdir(self._folder)) if self._folder is not None else []
 
     def take(self, name: str) -> bytes:
         """The content of one file, which then goes.
@@ -51,7 +53,7 @@ class CalibrationFrames:
         names = self.names()
         if self._folder is None or name not in names:
             raise CommandRangeError("file", f"no file {name!r} waits", "Calibrate again")
-        path = Path(self._folder.name) / name
+        path = self._folder / name
         data = path.read_bytes()
         path.unlink()
         if names == [name]:
@@ -61,5 +63,5 @@ class CalibrationFrames:
     def discard(self) -> None:
         """Remove what is there; idempotent."""
         if self._folder is not None:
-            self._folder.cleanup()
+            shutil.rmtree(self._folder, ignore_errors=True)
             self._folder = None
