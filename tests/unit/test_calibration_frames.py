@@ -51,7 +51,7 @@ def test_what_a_killed_daemon_left_goes_and_nothing_else(state: Path) -> None:
     (state / "calibration-abc").mkdir()
     (state / "calibration-abc" / "000.color.png").write_text("old")
     (state / "last_stop.json").write_text("{}")
-    frames = CalibrationFrames()
+    CalibrationFrames()
     assert [path.name for path in state.iterdir()] == ["last_stop.json"]
 
 
