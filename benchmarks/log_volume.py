@@ -47,7 +47,7 @@ def collect(seconds: float) -> tuple[float, list[tuple[float, logging.LogRecord]
         began_s = time.monotonic()
         timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGTERM))
         timer.start()
-        asyncio.run(Daemon(parse({**ABSENT, **sections})).run())
+        asyncio.run(Daemon(parse({**ABSENT, **sections}), None).run())
         ran_s = time.monotonic() - began_s
     return ran_s, [(at_s - began_s, record) for at_s, record in collector.records]
 

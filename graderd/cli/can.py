@@ -52,7 +52,7 @@ def is_the_daemons(daemon: Daemon, sources: list[str]) -> bool:
     try:
         bus: dict[str, Any] = daemon.get("/v1/config")["can"]
     except CliError as error:
-        if error.exit_code is not ExitCode.NO_DAEMON:
+        if error.exit_code is not ExitCode.NO_DAEMON or isinstance(error.__cause__, PermissionError):
             raise
         return False
     return not sources or (bus["interface"] == "slcan" and Path(bus["channel"]).resolve() == Path(sources[0]).resolve())

@@ -13,34 +13,66 @@ import os
 import socket
 import struct
 import time
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import Enum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 from urllib.parse import quote, urlencode
 
 import typer
 
+from graderd import places
 from graderd.cli.console import CliError, ExitCode
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
-SYSTEM_SOCKET = Path("/run/graderd/graderd.sock")
 TIMEOUT_S = 5.0
 BUSY_RETRY_S = 3.0
 
 
 def default_socket() -> Path:
-    """$GRADERD_SOCKET, else the service's socket, else the one of a daemon this user runs."""
+    """$GRADERD_SOCKET, else the one the machine's configuration names, else the service's, else the one of a daemon
+    this user runs: the first that is there, or else is kept from this user."""
     named = os.environ.get("GRADERD_SOCKET")
     if named:
         return Path(named)
     own = os.environ.get("XDG_RUNTIME_DIR")
-    if own and not SYSTEM_SOCKET.exists():
-        return Path(own) / "graderd" / "graderd.sock"
-    return SYSTEM_SOCKET
+    own_socket = [Path(own) / "graderd" / "graderd.sock"] if own else []
+    known = [*_configured_socket(), places.SOCKET, *own_socket]
+    for wanted in (_Presence.THERE, _Presence.KEPT_FROM_US):
+        for path in known:
+            if _presence(path) is wanted:
+                return path
+    return (own_socket or known)[0]
+
+
+class _Presence(Enum):
+    THERE = auto()
+    KEPT_FROM_US = auto()
+    ABSENT = auto()
+
+
+def _presence(path: Path) -> _Presence:
+    try:
+        path.stat()
+    except PermissionError:
+        return _Presence.KEPT_FROM_US
+    except OSError:
+        return _Presence.ABSENT
+    return _Presence.THERE
+
+
+def _configured_socket() -> list[Path]:
+    """``api.socket`` of the machine's configuration, read without judging the rest."""
+    try:
+        socket_path = tomllib.loads(places.CONFIG.read_text(encoding="utf-8"))["api"]["socket"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return []
+    return [Path(socket_path)] if isinstance(socket_path, str) and socket_path else []
 
 
 def client_name() -> str:

@@ -69,6 +69,33 @@ def test_explain_lists_all_and_suggests_the_nearest(capsys: Capture) -> None:
     assert "Did you mean lift_left.overload?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('[tilt]\nprofile = "electrak_xx"\n', "electrak_xx"),
+        ('[rotation]\nprofile = "ph45"\n', "no firmware profile 'ph45'"),
+        (f'[api]\nsocket = "/run/{"x" * 120}"\n', "api.socket"),
+        ('[api]\nsocket = ""\n', "api.socket"),
+        ('[api]\nsocket_group = "no such group"\n', "api.socket_group"),
+        ("[camera]\nrate_hz = -1\n", "camera.rate_hz"),
+    ],
+)
+def test_check_refuses_what_run_refuses_and_run_before_anything_starts(
+    tmp_path: Path, text: str, says: str, capsys: Capture
+) -> None:
+    path = tmp_path / "graderd.toml"
+    path.write_text(text)
+    assert run_app(["config", "check", str(path)]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert says in said
+    run = [sys.executable, "-m", "graderd", "run", "--sim", "--config", str(path)]
+    done = subprocess.run(run, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert says in done.stderr
+
+
 def test_config_check_tells_each_mistake_in_a_line(tmp_path: Path, capsys: Capture) -> None:
     good, bad = tmp_path / "good.toml", tmp_path / "bad.toml"
     good.write_text("[rotation]\nmax_deg = 60.0\n")

@@ -16,10 +16,11 @@ from graderd.core import commands as cmd
 from graderd.core.machine import Mode
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
-from graderd.runtime.app.backends import check_plugins
+from graderd.runtime.app.check import problems
 from graderd.runtime.app.devices import build_devices, build_stop_input
 from graderd.runtime.app.hang_watch import HangWatch
 from graderd.runtime.app.journal import set_up_logging
+from graderd.runtime.app.last_run import remember
 from graderd.runtime.app.services import build_services
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
 from graderd.runtime.control import ControlLoop
@@ -41,22 +42,24 @@ def run_daemon(config_path: Path | None, sim: bool, rig_dir: Path | None, as_jso
     set_up_logging(as_json)
     try:
         config = load(config_path)
-        check_plugins(config)
+        refusals = problems(config)
     except ConfigError as error:
-        for line in error.problems:
+        refusals = error.problems
+    if refusals:
+        for line in refusals:
             log.error("%s", line)
         return 2
-    problems: list[DeviceError] = []
+    failures: list[DeviceError] = []
     try:
-        asyncio.run(_main(config, sim, rig_dir))
+        asyncio.run(_main(config, config_path, sim, rig_dir))
     except* DeviceError as group:
-        problems = _leaves(group)
-    for problem in problems:
-        log.error("%s", problem)
-    return 1 if problems else 0
+        failures = _leaves(group)
+    for failure in failures:
+        log.error("%s", failure)
+    return 1 if failures else 0
 
 
-async def _main(config: Config, sim: bool, rig_dir: Path | None) -> None:
+async def _main(config: Config, source: Path | None, sim: bool, rig_dir: Path | None) -> None:
     rig: RigProcess | None = None
     own_directory: Path | None = None
     if sim and rig_dir is None:
@@ -68,7 +71,7 @@ async def _main(config: Config, sim: bool, rig_dir: Path | None) -> None:
             config = attach(config, rig.directory)
         elif rig_dir is not None:
             config = attach(config, rig_dir)
-        daemon = Daemon(config, rig)
+        daemon = Daemon(config, source, rig)
         # What was imported stays for good: a full collection that looked at it would hold up several ticks.
         gc.collect()
         gc.freeze()
@@ -83,9 +86,10 @@ async def _main(config: Config, sim: bool, rig_dir: Path | None) -> None:
 class Daemon:
     """Everything that runs, and the order in which it ends."""
 
-    def __init__(self, config: Config, rig: RigProcess | None = None) -> None:
+    def __init__(self, config: Config, source: Path | None, rig: RigProcess | None = None) -> None:
         clock = SystemClock()
         self._config = config
+        self._source = source
         self._rig = rig
         self._notifier = SystemdNotifier()
         self._hang_watch = HangWatch()
@@ -135,6 +139,7 @@ class Daemon:
                 api = group.create_task(self._serve(answering), name="api")
                 # A second daemon learns here that the socket is taken: before it touches a device.
                 await answering.wait()
+                remember(self._config, self._source)
                 tasks = [
                     group.create_task(self._loop.run(), name="control-tick"),
                     group.create_task(self._eyes.run(), name="perception"),

@@ -171,12 +171,9 @@ class Stack:
 
     async def guard(self) -> int:
         """Run ``graderd guard`` as systemd does after the daemon ended; returns its exit status."""
-        code = (
-            "import sys; from pathlib import Path; from graderd.runtime.app.guard import run_guard; "
-            "sys.exit(run_guard(Path(sys.argv[1]), Path(sys.argv[2])))"
-        )
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", code, str(self.config_path), str(self.directory)
+            *(sys.executable, "-m", "graderd", "guard", "--config", str(self.config_path)),
+            env=os.environ | {"STATE_DIRECTORY": ""},
         )
         return await process.wait()
 
