@@ -102,7 +102,7 @@ def main() -> int:
     signal.signal(signal.SIGUSR1, Hooks(options.rig_dir).on_signal)
     os.environ["GRADERD_CAMPAIGN_LIE"] = str(options.rig_dir / "lie.json")
     command = (sys.executable, "-m", WORKER)
-    vars(product)["PerceptionWorker"] = partial(PerceptionSupervisor, command=command)
+    vars(product)["PerceptionSupervisor"] = partial(PerceptionSupervisor, command=command)
     return product.run_daemon(options.config, False, options.rig_dir, True)
 
 
