@@ -34,13 +34,17 @@ import socket
 import struct
 import threading
 import time
+import tomllib
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
+from enum import Enum, auto
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 from urllib.parse import quote, urlencode, urlsplit
+
+from graderd import places
 
 if TYPE_CHECKING:
     from websockets.asyncio.client import ClientConnection as AsyncConnection
@@ -51,7 +55,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-SYSTEM_SOCKET: Final = Path("/run/graderd/graderd.sock")
 TIMEOUT_S: Final = 5.0
 SERVICE_TIMEOUT_S: Final = 120.0
 LEASE_HZ: Final = 10.0
@@ -117,14 +120,44 @@ class NotReachedError(ClientError):
 
 
 def default_socket() -> Path:
-    """$GRADERD_SOCKET, else the service's socket, else the one of a daemon this user runs."""
+    """$GRADERD_SOCKET, else the one the machine's configuration names, else the service's, else the one of a daemon
+    this user runs: the first that is there, or else is kept from this user."""
     named = os.environ.get("GRADERD_SOCKET")
     if named:
         return Path(named)
     own = os.environ.get("XDG_RUNTIME_DIR")
-    if own and not SYSTEM_SOCKET.exists():
-        return Path(own) / "graderd" / "graderd.sock"
-    return SYSTEM_SOCKET
+    own_socket = [Path(own) / "graderd" / "graderd.sock"] if own else []
+    known = [*_configured_socket(), places.SOCKET, *own_socket]
+    for wanted in (_Presence.THERE, _Presence.KEPT_FROM_US):
+        for path in known:
+            if _presence(path) is wanted:
+                return path
+    return (own_socket or known)[0]
+
+
+class _Presence(Enum):
+    THERE = auto()
+    KEPT_FROM_US = auto()
+    ABSENT = auto()
+
+
+def _presence(path: Path) -> _Presence:
+    try:
+        path.stat()
+    except PermissionError:
+        return _Presence.KEPT_FROM_US
+    except OSError:
+        return _Presence.ABSENT
+    return _Presence.THERE
+
+
+def _configured_socket() -> list[Path]:
+    """``api.socket`` of the machine's configuration, read without judging the rest."""
+    try:
+        socket_path = tomllib.loads(places.CONFIG.read_text(encoding="utf-8"))["api"]["socket"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return []
+    return [Path(socket_path)] if isinstance(socket_path, str) and socket_path else []
 
 
 def user_name() -> str:
