@@ -20,7 +20,7 @@ from pathlib import Path
 from graderd.client import AsyncClient, ClientError, LeaseLostError, RefusedError
 from graderd.core.status import Status
 from graderd.hal.errors import DeviceError
-from graderd.runtime.app.sim import RigProcess, new_rig_directory
+from graderd.runtime.app.sim import RigProcess, Starting, new_rig_directory
 from graderd.simulator.control_client import RigControl
 from graderd.simulator.show import Show, make_show
 
@@ -156,16 +156,16 @@ async def _end(process: asyncio.subprocess.Process) -> None:
 
 
 async def _answering(client: AsyncClient, daemon: asyncio.subprocess.Process, log_path: Path) -> None:
-    deadline_s = time.monotonic() + STALLED_S
-    while time.monotonic() < deadline_s:
-        if daemon.returncode is not None:
-            said = await asyncio.to_thread(log_path.read_text, errors="replace")
-            raise DemoFailedError(f"the daemon ended at its start: {said[-500:]}")
+    starting = Starting(daemon.pid)
+    while True:
         with contextlib.suppress(ClientError):
             await client.status()
             return
+        why = "ended" if daemon.returncode is not None else "stalled" if starting.has_stalled() else ""
+        if why:
+            said = await asyncio.to_thread(log_path.read_text, errors="replace")
+            raise DemoFailedError(f"the daemon {why} at its start: {said[-500:]}")
         await asyncio.sleep(0.1)
-    raise DemoFailedError(f"the daemon did not answer within {STALLED_S:g} s")
 
 
 class _Demo:
