@@ -158,8 +158,9 @@ async def _end(process: asyncio.subprocess.Process) -> None:
 async def _answering(client: AsyncClient, daemon: asyncio.subprocess.Process, log_path: Path) -> None:
     starting = Starting(daemon.pid)
     while True:
-        with contextlib.suppress(ClientError):
-            await client.status()
+        with contextlib.suppress(ClientError, TimeoutError):
+            async with asyncio.timeout(5.0):  # its socket may be there long before it answers
+                await client.status()
             return
         why = "ended" if daemon.returncode is not None else "stalled" if starting.has_stalled() else ""
         if why:

@@ -18,7 +18,9 @@ from graderd.hal.errors import DeviceMissingError
 from graderd.hal.settings import Ph54Settings
 
 STALLED_S = 30.0
-"""A start may take as long as it gets on: on a machine busy with other things that is long."""
+START_CPU_S = 60.0
+"""A start may take as long as it gets on, on a machine busy with other things: until it has not run at all for the one
+time, or has used the other of a processor (an idle machine: 3 s)."""
 RESTART_PAUSE_S = 1.0
 RIG_FRAME_AGE_S = 0.4
 """A rendered picture is as old as its rendering took, which a busy machine stretches; a real camera has 0.1 s."""
@@ -41,19 +43,19 @@ class Starting:
 
     def __init__(self, pid: int) -> None:
         self._path = Path(f"/proc/{pid}/schedstat")
-        self._seen = ""
+        self._ran_s = 0.0
         self._since_s = time.monotonic()
 
     def has_stalled(self) -> bool:
-        """Whether it has not run for ``STALLED_S``."""
+        """Whether it has not run for ``STALLED_S``, or for ``START_CPU_S`` in vain."""
         try:
-            ran = self._path.read_text(encoding="ascii").split()[0]
+            ran_s = int(self._path.read_text(encoding="ascii").split()[0]) / 1e9
         except OSError:
-            ran = self._seen  # it has ended, which its parent sees
+            return False  # it has ended, which its parent sees
         now_s = time.monotonic()
-        if ran != self._seen:
-            self._seen, self._since_s = ran, now_s
-        return now_s - self._since_s > STALLED_S
+        if ran_s != self._ran_s:
+            self._ran_s, self._since_s = ran_s, now_s
+        return now_s - self._since_s > STALLED_S or ran_s > START_CPU_S
 
 
 class RigProcess:
@@ -93,7 +95,7 @@ class RigProcess:
                 raise DeviceMissingError("rig", f"ended with status {self._process.returncode} before it was ready")
             if starting.has_stalled():
                 await self.stop()
-                raise DeviceMissingError("rig", f"not ready, and doing nothing for {STALLED_S:g} s")
+                raise DeviceMissingError("rig", "does not get ready")
             await asyncio.sleep(0.02)
 
     async def run(self) -> None:
