@@ -61,9 +61,9 @@ async def test_a_recording_drives_the_daemon(tmp_path: Path) -> None:
         assert seen.soil.share_left > 0.5
         assert seen.mode == "disarmed"
         await whole.until(lambda s: all(r.met for r in s.readiness if r.mandatory))
-        assert (await whole.command("arm")).status_code == 200
+        await whole.command("arm")
         await whole.until(lambda s: s.mode == "manual")
-        assert (await whole.command("auto")).status_code == 200
+        await whole.command("auto")
         decided = await whole.until(lambda s: s.decision.zone is not None)
         assert decided.decision.zone == "left"
         await whole.until(lambda s: (s.axes["rotation"].measured or 0.0) > 3.0)
