@@ -10,8 +10,8 @@ import pytest
 from graderd.drivers.simulated.camera import RigCamera
 from graderd.hal.settings import CameraSettings
 from graderd.simulator.control_client import RigControl
+from harness.realsense_devices import SoftD455, record
 from tests.machine import machine, start_rig
-from tests.realsense_devices import SoftD455, record
 
 pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(240)]
 FRAMES_N = 30

@@ -26,7 +26,7 @@ from graderd.perception import CameraCalibration
 from graderd.perception.calibration import with_pose
 from graderd.perception.frame_set import Entry, FrameSetWriter
 from graderd.perception.settings import StreamCalibration
-from tests.perception_scenes import Scene, render
+from harness.perception_scenes import Scene, render
 
 Captured = pytest.CaptureFixture[str]
 COLOR, DEPTH = (480, 300), (424, 240)

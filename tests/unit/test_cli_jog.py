@@ -19,7 +19,7 @@ from graderd.cli.move import VALUE, Arrival, JogValue, parse_value
 from graderd.core.axes import JOG_AXES, JogName
 from graderd.core.machine import Mode
 from graderd.core.status import FaultStatus
-from tests.unit.api_daemon import FakeDaemon, serving, within
+from harness.api_daemon import FakeDaemon, serving, within
 from tests.unit.test_cli_modes import Capture, cli, command_line
 
 

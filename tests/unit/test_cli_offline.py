@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from graderd.cli.app import make_cli, run_app
 from graderd.core.faults.catalogue import CATALOGUE
-from tests.unit.api_daemon import serving
+from harness.api_daemon import serving
 from tests.unit.test_cli_modes import Capture, cli
 
 

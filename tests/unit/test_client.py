@@ -25,7 +25,7 @@ from graderd.client import (
     RefusedError,
 )
 from graderd.core.machine import Mode, Unmet
-from tests.unit.api_daemon import JPEG, FakeDaemon, serving
+from harness.api_daemon import JPEG, FakeDaemon, serving
 
 
 async def in_thread(work: Callable[[], Any]) -> Any:

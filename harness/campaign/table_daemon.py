@@ -14,10 +14,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from tests.fault.campaign.conduct import BRAKE_S, EVERYTHING, SLACK_S, STILL_S, detect, react
-from tests.fault.campaign.model import Action, Case, Outcome, Phase
-from tests.fault.campaign.stack import CONFIG, CampaignError, Stack
-from tests.fault.campaign.table import heal
+from harness.campaign.conduct import BRAKE_S, EVERYTHING, SLACK_S, STILL_S, detect, react
+from harness.campaign.model import Action, Case, Outcome, Phase
+from harness.campaign.stack import CONFIG, CampaignError, Stack
+from harness.campaign.table import heal
 
 IDLE, TURNING, LIFTING = Phase.IDLE, Phase.TURNING, Phase.LIFTING
 WATCHDOG_S = 0.2
@@ -281,7 +281,7 @@ async def flood(stack: Stack, _: Case, phase: Phase, outcome: Outcome) -> None:
 
     async def attack() -> str:
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "tests.fault.campaign.flood", str(stack.directory / "graderd.sock"), "4.0"),
+            *(sys.executable, "-m", "harness.campaign.flood", str(stack.directory / "graderd.sock"), "4.0"),
             stdout=asyncio.subprocess.PIPE,
         )
         said, _ = await process.communicate()

@@ -17,7 +17,7 @@ import httpx
 
 from graderd.hal.errors import DeviceError
 from graderd.simulator.control_client import RigControl
-from tests.fault.campaign.watch import Watch
+from harness.campaign.watch import Watch
 
 START_S = 60.0
 CLIENT = "campaign"
@@ -138,7 +138,7 @@ class Stack:
         """Start the daemon; its log is appended to the former's."""
         with self.log_path.open("ab") as log:
             self._daemon = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "tests.fault.campaign.daemon"),
+                *(sys.executable, "-m", "harness.campaign.daemon"),
                 *("--config", str(self.config_path), "--rig-dir", str(self.directory)),
                 env=os.environ | {"GRADERD_CAMPAIGN_BREAK": self._broken, "STATE_DIRECTORY": ""},
                 stdout=log,
@@ -158,7 +158,7 @@ class Stack:
         return self._rig
 
     def hook(self, **wanted: float) -> None:
-        """Let the daemon do something to itself; see ``tests.fault.campaign.daemon``."""
+        """Let the daemon do something to itself; see ``harness.campaign.daemon``."""
         (self.directory / "hook.json").write_text(json.dumps(wanted), encoding="utf-8")
         self.daemon.send_signal(signal.SIGUSR1)
 

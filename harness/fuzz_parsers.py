@@ -1,4 +1,4 @@
-"""Damage for everything that reads text from outside: ``python -m benchmarks.fuzz_parsers [--strings N] [--seed N]``.
+"""Damage for everything that reads text from outside: ``python -m harness.fuzz_parsers [--strings N] [--seed N]``.
 
 Targets: configuration files and their migration, frame sets (manifest and camera file), names of firmware profiles,
 messages of the perception child, the state file, commands of clients and of the rig's. Each gets valid texts with bytes
@@ -86,7 +86,9 @@ def targets(directory: Path) -> dict[str, Target]:
     return {
         "config": Target((config_text,), _in_file(config_path, lambda: load(config_path)), (ConfigError,)),
         "migration": Target(
-            (config_text, old), lambda data: migrate_text(data.decode("utf-8", "replace"), steps), (ConfigError,)
+            (config_text, old),
+            lambda data: migrate_text(data.decode("utf-8", "replace"), steps, current=1),
+            (ConfigError,),
         ),
         "manifest": Target(
             (manifest,), _in_file(frame_set / "manifest.csv", lambda: FrameSet(frame_set)), (DeviceError,)
