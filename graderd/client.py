@@ -271,7 +271,7 @@ class Client:
         return _reply_of(self.post("/v1/stop", _stop_body(self.name, reason)))
 
     def command(self, command: str, **fields: Any) -> Reply:
-        """One command (``arm``, ``disarm``, ``reset``, ``auto``, ``manual``…): see docs/integrators/api.md.
+        """One command (``arm``, ``disarm``, ``auto``, ``manual``…): see docs/integrators/api.md.
 
         For ``jog`` and ``preset`` there is :meth:`lease`, which ends with its block.
 
@@ -280,6 +280,14 @@ class Client:
             NoDaemonError: not answered, perhaps done (``may_be_done``). It is not repeated.
         """
         return _reply_of(self.post("/v1/commands", {"command": command, "client": self.name, **fields}))
+
+    def reset(self, stop_n: int | None = None) -> Reply:
+        """Leave the latched stop for disarmed.
+
+        It clears the stop with this number (``stop_n`` of the status), None: the one that is latched at the call; never
+        one that came meanwhile.
+        """
+        return self.command("reset", stop_n=self.get("/v1/status")["stop_n"] if stop_n is None else stop_n)
 
     def service(self, name: str, timeout_s: float = SERVICE_TIMEOUT_S, **arguments: Any) -> dict[str, Any]:
         """Run a device service, such as ``rotation.verify_profile``, and return what it found."""
@@ -527,6 +535,10 @@ class AsyncClient:
     async def command(self, command: str, **fields: Any) -> Reply:
         """See :meth:`Client.command`."""
         return await _in_thread(lambda: self._waiting.command(command, **fields))
+
+    async def reset(self, stop_n: int | None = None) -> Reply:
+        """See :meth:`Client.reset`."""
+        return await _in_thread(lambda: self._waiting.reset(stop_n))
 
     async def service(self, name: str, timeout_s: float = SERVICE_TIMEOUT_S, **arguments: Any) -> dict[str, Any]:
         """See :meth:`Client.service`."""

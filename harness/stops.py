@@ -27,8 +27,7 @@ async def by_command_line(stack: Stack) -> None:
 
 
 async def by_stop_request(stack: Stack) -> None:
-    response = await stack.client.post("/v1/stop", json={"reason": "test"})
-    assert response.status_code == 200
+    assert (await stack.client.stop("test")).accepted
 
 
 async def by_command(stack: Stack) -> None:

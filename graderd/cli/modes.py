@@ -71,8 +71,8 @@ def register(app: typer.Typer) -> None:
 
         It clears the stop that is latched when the command starts, and none that comes meanwhile.
         """
-        daemon = daemon_of(context)
-        _tell(daemon.command("reset", stop_n=daemon.get("/v1/status")["stop_n"]), json)
+        client = client_of(context)
+        _tell(send(client, "reset", stop_n=client.get("/v1/status")["stop_n"]), json)
 
     @app.command(epilog=example("graderd auto"))
     def auto(context: typer.Context, json: Json = False) -> None:
@@ -89,9 +89,9 @@ def _send(context: typer.Context, command: str, as_json: bool) -> None:
     _tell(send(client_of(context), command), as_json)
 
 
-def send(client: Client, command: str) -> dict[str, Any]:
-    """A command without arguments; its reply as it came."""
-    reply: dict[str, Any] = client.post("/v1/commands", {"command": command, "client": client.name})
+def send(client: Client, command: str, **fields: Any) -> dict[str, Any]:
+    """A command; its reply as it came."""
+    reply: dict[str, Any] = client.post("/v1/commands", {"command": command, "client": client.name, **fields})
     return reply
 
 

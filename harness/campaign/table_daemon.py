@@ -56,7 +56,7 @@ async def starve_worker(stack: Stack) -> None:
     resource.prlimit(pid, resource.RLIMIT_AS, (pages * resource.getpagesize(), resource.RLIM_INFINITY))
     with suppress(TimeoutError):
         async with asyncio.timeout(0.05):  # nobody waits for an answer that will not come
-            await stack.client.get("/v1/preview.jpg")
+            await stack.client.preview_jpeg()
 
 
 async def feed_worker(stack: Stack) -> None:

@@ -49,7 +49,7 @@ async def test_everything_but_moving_both_ways(tmp_path: Path) -> None:
                 assert next(texts).startswith("(1.000000) can0")
             assert client.stop("enough").accepted
             assert client.status().last_stop == "enough (by test)"
-            client.command("reset")
+            assert client.reset().accepted
 
     async def on_a_loop(path: Path) -> None:
         async with AsyncClient(path, name="test") as client:
@@ -66,7 +66,7 @@ async def test_everything_but_moving_both_ways(tmp_path: Path) -> None:
                 assert (await anext(texts)).startswith("(1.000000) can0")
             assert (await client.stop("enough")).accepted
             assert (await client.status()).last_stop == "enough (by test)"
-            await client.command("reset")
+            assert (await client.reset()).accepted
 
     async with serving(tmp_path) as (_, path):
         await in_thread(lambda: waiting(path))
@@ -242,7 +242,7 @@ COMMANDS: dict[str, dict[str, Any]] = {
     "arm": {},
     "auto": {},
     "manual": {},
-    "reset": {},
+    "reset": {"stop_n": 1},
     "disarm": {},
     "jog": {"axis": "rotate", "value": 1.0},
     "preset": {"name": "transport"},
