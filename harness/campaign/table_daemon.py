@@ -14,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from graderd.client import ClientError
 from harness.campaign.conduct import BRAKE_S, EVERYTHING, SLACK_S, STILL_S, detect, react
 from harness.campaign.model import Action, Case, Outcome, Phase
 from harness.campaign.stack import CONFIG, CampaignError, Stack
@@ -54,7 +55,7 @@ async def starve_worker(stack: Stack) -> None:
     pid = stack.worker_pid()
     pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[0])
     resource.prlimit(pid, resource.RLIMIT_AS, (pages * resource.getpagesize(), resource.RLIM_INFINITY))
-    with suppress(TimeoutError):
+    with suppress(TimeoutError, ClientError):
         async with asyncio.timeout(0.05):  # nobody waits for an answer that will not come
             await stack.client.preview_jpeg()
 
