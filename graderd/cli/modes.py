@@ -59,7 +59,7 @@ def register(app: typer.Typer) -> None:
         """
         try:
             client = client_of(context)
-            # As it came: the typed reply would load pydantic.
+            # As it came: the typed reply would load the models.
             _tell(client.post("/v1/stop", {"client": client.name, "reason": reason[:200]}), json)
         except ClientError as error:
             error.remedy = f"{error.remedy}. If the blade moves, use the emergency stop"
