@@ -23,7 +23,7 @@ import tomlkit
 from pydantic import TypeAdapter, ValidationError
 
 from graderd.config import Config, ConfigError, load
-from graderd.config.migrate import migrate_text, rename
+from graderd.config.migrate import STEPS, migrate_text, rename
 from graderd.core.blade import BladeGeometry
 from graderd.core.commands import AnyCommand, Command
 from graderd.core.soil import SoilObservation, Zone
@@ -81,13 +81,16 @@ def targets(directory: Path) -> dict[str, Target]:
     manifest, described = (frame_set / "manifest.csv").read_bytes(), (frame_set / "camera.json").read_bytes()
     seen = Observed.of(SoilObservation(1.0, Zone.LEFT, 0.5, "why", 0.9, 0.1, 0.0))
     config_text, old = _toml(Config()), b'version = 0\n[servo]\nport = "x"\n[actuators.left]\naddress_n = 5\n'
-    steps = {0: lambda document: rename(document, "servo", "rotation") + rename(document, "actuators.left", "lift")}
+    steps = {
+        **STEPS,
+        0: lambda document: rename(document, "servo", "rotation") + rename(document, "actuators.left", "lift"),
+    }
     config_path = directory / "g.toml"
     return {
         "config": Target((config_text,), _in_file(config_path, lambda: load(config_path)), (ConfigError,)),
         "migration": Target(
             (config_text, old),
-            lambda data: migrate_text(data.decode("utf-8", "replace"), steps, current=1),
+            lambda data: migrate_text(data.decode("utf-8", "replace"), steps),
             (ConfigError,),
         ),
         "manifest": Target(

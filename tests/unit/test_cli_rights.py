@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from graderd import places
-from graderd.cli import client
+from graderd import client, places
 from graderd.cli.app import run_app
 from graderd.config import ConfigError, load
 from graderd.config.rewrite import check_rights, rewrite
