@@ -22,6 +22,7 @@ from graderd.cli import (
     status,
 )
 from graderd.cli.console import CliError, ExitCode, print_error, print_text
+from graderd.client import ClientError, NoDaemonError
 from graderd.hal.errors import DeviceError
 
 COMMANDS = (
@@ -78,6 +79,9 @@ def run_app(arguments: list[str]) -> int:
     except CliError as error:
         print_error(error.where, error.cause, error.remedy, as_json)
         return error.exit_code
+    except ClientError as error:
+        print_error(error.where, error.cause, error.remedy, as_json)
+        return ExitCode.NO_DAEMON if isinstance(error, NoDaemonError) else ExitCode.FAILED
     except DeviceError as error:
         print_error(error.where, error.cause, error.remedy, as_json)
         return ExitCode.FAILED

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from graderd import places
-from graderd.cli.client import daemon_of
-from graderd.cli.console import CliError, ExitCode, Json, example, plain_table, print_json, print_text
+from graderd.cli.console import CliError, ExitCode, Json, client_of, example, plain_table, print_json, print_text
 from graderd.hal.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -154,7 +153,7 @@ def _live(context: typer.Context, room: Path, angles_deg: str, yes: bool, as_jso
         angles = [float(part) for part in angles_deg.split(",")]
     except ValueError:
         raise CliError("--angles-deg", f"{angles_deg!r} is not a list of numbers", "", ExitCode.USAGE) from None
-    daemon = daemon_of(context)
+    daemon = client_of(context)
     if not as_json:
         print_text(
             f"The blade will turn to {', '.join(f'{angle:+g}' for angle in angles)} degrees, one after the other."

@@ -8,10 +8,12 @@ import sys
 from collections.abc import Sequence
 from enum import IntEnum
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from graderd.client import Client
 from graderd.hal.text import printable, terminal_safe_json
 
 if TYPE_CHECKING:
@@ -40,6 +42,12 @@ class CliError(Exception):
         self.cause = cause
         self.remedy = remedy
         self.exit_code = exit_code
+
+
+def client_of(context: typer.Context) -> Client:
+    """A client of the daemon that the global options name."""
+    options = context.find_root().obj
+    return Client(options if isinstance(options, Path) else None)
 
 
 def error_line(where: str, cause: str, remedy: str = "") -> str:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
-import pty
-import tty
 from pathlib import Path
 from typing import Final
 
 from graderd.drivers.j1939.ids import Frame
 from graderd.simulator.actuators.wire import Wire
+from graderd.simulator.terminal import LinkedTerminal
 
 _OK: Final = b"\r"
 _ERROR: Final = b"\a"
@@ -27,7 +25,8 @@ class SlcanAdapter:
     def __init__(self, wire: Wire, link: Path) -> None:
         self._wire = wire
         self._link = link
-        self._master_fd = self._slave_fd = -1
+        self._terminal: LinkedTerminal | None = None
+        self._master_fd = -1
         self._open = False
         self._listen_only = False
         self._line = bytearray()
@@ -54,31 +53,22 @@ class SlcanAdapter:
         """Create the terminal and point the link to it."""
         if self.plugged:
             return
-        self._master_fd, self._slave_fd = pty.openpty()
-        tty.setraw(self._slave_fd)
-        os.set_blocking(self._master_fd, False)
-        temporary = self._link.with_name(self._link.name + ".new")
-        with contextlib.suppress(FileNotFoundError):
-            temporary.unlink()
-        temporary.symlink_to(os.ttyname(self._slave_fd))
-        temporary.replace(self._link)
+        self._terminal = LinkedTerminal(self._link)
+        self._master_fd = self._terminal.master
         asyncio.get_running_loop().add_reader(self._master_fd, self._on_readable)
         self._wire.attach(self._hear)
 
     def unplug(self) -> None:
         """Take the terminal away: the host sees a hang-up, the link is gone."""
-        if not self.plugged:
+        if self._terminal is None:
             return
         self._wire.detach(self._hear)
         asyncio.get_running_loop().remove_reader(self._master_fd)
-        os.close(self._master_fd)
-        os.close(self._slave_fd)
-        self._master_fd = self._slave_fd = -1
+        self._terminal.close()
+        self._terminal, self._master_fd = None, -1
         self._open = False
         self._unsent = b""
         self._line.clear()
-        with contextlib.suppress(FileNotFoundError):
-            self._link.unlink()
 
     def set_deaf(self, deaf: bool) -> None:
         """Stop reading what the host sends, as a hung adapter does; its buffer then fills up."""

@@ -45,7 +45,7 @@ from graderd.hal.service import DeviceService
 from graderd.hal.settings import CanSettings, Positive, RotatorSettings, Settings
 from graderd.runtime.app.backends import check_plugins, rotator_of
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 from tests.contract.conformance import RotatorConformance, RotatorStand
 
 NAME: Final = f"{__name__}:VALVE"

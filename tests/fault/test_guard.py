@@ -23,9 +23,9 @@ from graderd.hal.settings import Ph54Settings
 from graderd.runtime.app.last_run import remember
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
-from tests.fault.campaign.conduct import EVERYTHING, come_to
-from tests.fault.campaign.model import Phase
-from tests.fault.campaign.stack import Stack
+from harness.campaign.conduct import EVERYTHING, come_to
+from harness.campaign.model import Phase
+from harness.campaign.stack import Stack
 
 ADDRESSES = {"lift_left": 19, "lift_right": 20, "tilt": 27}
 FAR = {"lift_left": 290.0, "lift_right": 290.0, "tilt": 95.0}

@@ -24,7 +24,7 @@ from graderd.api.settings import TcpSettings
 from graderd.api.tcp_guard import load_or_make_token
 from graderd.core.machine import Mode
 from graderd.hal.errors import DeviceError
-from tests.unit.api_daemon import FakeDaemon, longest_hold, serving, within
+from harness.api_daemon import FakeDaemon, longest_hold, serving, within
 
 HOLD_S = 0.05
 """What the interface may keep the tick waiting, in computing time: what else the machine does does not count."""
@@ -242,7 +242,7 @@ async def test_a_flood_of_strangers_leaves_the_tick_its_time(tmp_path: Path, cap
     tcp = tcp_settings(tmp_path)
     async with serving(tmp_path, tcp=tcp) as (daemon, _), longest_hold() as hold:
         flood = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "tests.unit.api_flood", f"localhost:{tcp.port_n}", "3", "ask", "100"),
+            *(sys.executable, "-m", "harness.api_flood", f"localhost:{tcp.port_n}", "3", "ask", "100"),
             stdout=asyncio.subprocess.PIPE,
         )
         assert flood.stdout is not None

@@ -26,7 +26,7 @@ from graderd.perception import CameraCalibration
 from graderd.perception.calibration import with_pose
 from graderd.perception.frame_set import Entry, FrameSetWriter
 from graderd.perception.settings import StreamCalibration
-from tests.perception_scenes import Scene, render
+from harness.perception_scenes import Scene, render
 
 Captured = pytest.CaptureFixture[str]
 COLOR, DEPTH = (480, 300), (424, 240)
@@ -172,7 +172,7 @@ def test_the_daemon_turns_the_blade_only_with_consent(
             asked.append({"name": name, **arguments})
             return {"frame_set": "calibration-1", "files": names}
 
-    monkeypatch.setattr(command, "daemon_of", lambda _context: Daemon())
+    monkeypatch.setattr(command, "client_of", lambda _context: Daemon())
     monkeypatch.setattr(typer, "confirm", lambda _question, **_options: False)
     live = ["calibrate", "camera", "--config", str(config), "--save", str(config.parent / "x.jpg")]
     assert run_app(live) == 1
@@ -215,7 +215,7 @@ def test_nothing_moves_where_the_result_could_not_be_kept(
     config: Path, kept: str, monkeypatch: pytest.MonkeyPatch, capsys: Captured
 ) -> None:
     """Neither is the daemon asked for anything, nor the person."""
-    monkeypatch.setattr(command, "daemon_of", lambda _context: pytest.fail("the daemon was asked"))
+    monkeypatch.setattr(command, "client_of", lambda _context: pytest.fail("the daemon was asked"))
     picture = config.parent / ("nowhere" if kept == "picture" else "") / "shown.png"
     if kept == "configuration":
         monkeypatch.setattr(os, "fsync", refuse)

@@ -20,7 +20,7 @@ from graderd import places
 from graderd.cli.app import run_app
 from graderd.cli.status import sections
 from graderd.core.machine import Mode, Unmet
-from tests.unit.api_daemon import FakeDaemon, serving, within
+from harness.api_daemon import FakeDaemon, serving, within
 
 Capture = pytest.CaptureFixture[str]
 

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from graderd import places
-from graderd.cli import client
+from graderd import client, places
 from graderd.cli.app import run_app
 from graderd.config import ConfigError, load
 from graderd.config.rewrite import check_rights, rewrite
@@ -114,6 +113,6 @@ def test_the_configured_socket_comes_first(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_stop_loads_nothing_heavy_to_find_its_socket() -> None:
-    code = "import sys, graderd.cli.client as c; c.default_socket(); "
+    code = "import sys, graderd.client as c; c.default_socket(); "
     code += "print([m for m in ('pydantic', 'numpy', 'tomlkit', 'graderd.config') if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -18,7 +18,7 @@ from graderd.core.machine import Mode
 from graderd.drivers.electrak.dump import FrameDecoder, text_of
 from graderd.drivers.j1939.ids import Frame
 from graderd.runtime.sd_notify import SystemdNotifier
-from tests.unit.api_daemon import serving, within
+from harness.api_daemon import serving, within
 from tests.unit.test_cli_modes import Capture, cli
 
 HOSTILE = "stop\nmode  auto: all is well\x1b[2J\x1b]0;title\x07\x9b31m\u202e\r"

@@ -29,7 +29,7 @@ from graderd.core.status import (
     Status,
 )
 from graderd.hal.lifecycle import Lifecycle
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 
 T = TypeVar("T")
 

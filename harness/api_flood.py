@@ -1,4 +1,4 @@
-"""Floods a socket with requests, as a process of its own: ``python -m tests.unit.api_flood SOCKET SECONDS KIND N``.
+"""Floods a socket with requests, as a process of its own: ``python -m harness.api_flood SOCKET SECONDS KIND N``.
 
 SOCKET: a unix socket's path, or HOST:PORT (then without a token).
 
@@ -69,4 +69,4 @@ async def _connected(target: str) -> tuple[asyncio.StreamReader, asyncio.StreamW
 
 
 if __name__ == "__main__":
-    print(json.dumps(asyncio.run(flood(sys.argv[1], float(sys.argv[2]), sys.argv[3], int(sys.argv[4])))))  # noqa: T201  (its one line of output)
+    print(json.dumps(asyncio.run(flood(sys.argv[1], float(sys.argv[2]), sys.argv[3], int(sys.argv[4])))))
