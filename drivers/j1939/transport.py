@@ -1,7 +1,7 @@
 """Transport protocol of SAE J1939-21: messages of 9 to 1785 bytes in packets of seven.
 
 To everybody: BAM, packets 50 to 200 ms apart. To one node: RTS, CTS, packets, end-of-message acknowledgement, with
-abort. Receiving and sending of both kinds; sessions, sizes and times are bounded.
+abort. Receiving and sending of both kinds; sessions, sizes, times and what others can make us send are bounded.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 from graderd.drivers.j1939.ids import GLOBAL, Frame, Pgn, make_id
+from graderd.drivers.j1939.limiter import Limiter
 
 MAX_SIZE: Final = 1785
 BAM_GAP_S: Final = 0.05
@@ -24,6 +25,13 @@ T3_S: Final = 1.25
 T4_S: Final = 1.05
 """Sender: longest wait after a CTS that says wait."""
 MAX_SESSIONS_N: Final = 16
+DATA_RATE_HZ: Final = 100.0
+"""Packets a second of all connections together, after a burst: about 6 % of a bus of 250 kbit/s."""
+DATA_BURST_N: Final = 16
+_ASKED_FOR_MAX_N: Final = 3
+"""A packet may be asked for again twice (J1939-21); the whole of a message may leave so often."""
+_OPEN_RATE_HZ: Final = 50.0
+_OPEN_BURST_N: Final = 20
 _CTS_WINDOW_N: Final = 16
 
 
@@ -43,6 +51,7 @@ class Abort(IntEnum):
     BUSY = 1
     RESOURCES = 2
     TIMEOUT = 3
+    RETRANSMITS = 5
     BAD_SEQUENCE = 7
     TOO_BIG = 9
 
@@ -78,6 +87,7 @@ class _Outgoing:
     due_s: float
     next_n: int = 1
     window_end_n: int = 0
+    sent_n: int = 0
     waiting: bool = False
 
     @property
@@ -93,6 +103,8 @@ class Transport:
         self.aborted_n = 0
         self._incoming: dict[tuple[int, int], _Incoming] = {}
         self._outgoing: dict[int, _Outgoing] = {}
+        self._data = Limiter(DATA_RATE_HZ, DATA_BURST_N)
+        self._opens = Limiter(_OPEN_RATE_HZ, _OPEN_BURST_N)
 
     # -- receiving --------------------------------------------------------------------------------------------------
 
@@ -149,6 +161,8 @@ class Transport:
         size, packets_n = int.from_bytes(data[1:3], "little"), data[3]
         broadcast = data[0] == Control.BAM
         if broadcast != (destination == GLOBAL) or (not broadcast and destination != self.address):
+            return []
+        if not broadcast and not self._opens.allow(now_s):
             return []
         key = (source, destination)
         if not 9 <= size <= MAX_SIZE or packets_n != math.ceil(size / 7):
@@ -208,7 +222,8 @@ class Transport:
                     body = bytes((Abort.TIMEOUT, 255, 255, 255))
                     frames.append(self._control(source, Control.ABORT, body, incoming.pgn))
         for destination, outgoing in tuple(self._outgoing.items()):
-            if now_s < outgoing.due_s:
+            frames += self._packets(outgoing, now_s)
+            if now_s < outgoing.due_s or destination not in self._outgoing:
                 continue
             if outgoing.waiting:
                 del self._outgoing[destination]
@@ -232,9 +247,23 @@ class Transport:
             body = bytes((Abort.BAD_SEQUENCE, 255, 255, 255))
             return [self._control(session.destination, Control.ABORT, body, session.pgn)]
         session.next_n = first
+        session.window_end_n = min(session.packets_n, first + count - 1)
         session.due_s = now_s + T3_S
-        last_n = min(session.packets_n, first + count - 1)
-        return [self._packet(session) for _ in range(last_n - first + 1)]
+        return self._packets(session, now_s)
+
+    def _packets(self, session: _Outgoing, now_s: float) -> list[Frame]:
+        """What a connection may send now of the packets it was asked for."""
+        frames: list[Frame] = []
+        while session.next_n <= session.window_end_n and self._data.allow(now_s):
+            if session.sent_n >= _ASKED_FOR_MAX_N * session.packets_n:
+                del self._outgoing[session.destination]
+                self.aborted_n += 1
+                body = bytes((Abort.RETRANSMITS, 255, 255, 255))
+                return [*frames, self._control(session.destination, Control.ABORT, body, session.pgn)]
+            session.sent_n += 1
+            session.due_s = now_s + T3_S
+            frames.append(self._packet(session))
+        return frames
 
     def _packet(self, session: _Outgoing) -> Frame:
         start = 7 * (session.next_n - 1)
