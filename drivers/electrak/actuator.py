@@ -80,6 +80,7 @@ class ElectrakActuator:
         self._resumed_at_s = -math.inf
         self._sent: Reading[float] | None = None
         self._sent_enabled = False
+        self._may_move = False
         self._overload = OverloadPolicy(settings.overload_retries_n)
         self._overload_detail = ""
         self._claimed_name: int | None = None
@@ -248,13 +249,14 @@ class ElectrakActuator:
             self._resumed_at_s = now_s
         self._control_at_s = now_s
         self._watch(now_s)
-        control = self._next_control(now_s)
-        self._sent_enabled = control.motion_enable
-        if control.motion_enable:
-            self._sent = Reading(control.target_mm, now_s)
-        self._counters["control_n"] += 1
-        can_id = make_id(_CONTROL_PRIORITY, Pgn.PROPRIETARY_A, source, self.address)
-        return Frame(can_id, self._codec.encode_control(control))
+        return self._control_message(self._next_control(now_s), source, now_s)
+
+    def stop_frame(self, source: int, now_s: float) -> Frame | None:
+        """Motion disabled; None where the actuator was told so and is seen at rest since."""
+        if not self._may_move:
+            return None
+        here_mm = self._track.feedback.position_mm if self._track.feedback else 0.0
+        return self._control_message(self._planner.disabled(here_mm), source, now_s)
 
     def on_feedback(self, data: bytes, now_s: float) -> None:
         """A feedback message from this address."""
@@ -276,6 +278,7 @@ class ElectrakActuator:
         self._track.take(feedback, now_s)
         self._thermal.update(feedback.current_a, now_s)
         self._planner.on_feedback(self._track.motion(now_s))
+        self._may_move = feedback.moving or self._sent_enabled
         if self._link.address is None:
             # Still awake from before, and about to sleep: what is heard while we may not speak is no answer to us.
             self._track.good_n = 0
@@ -308,6 +311,14 @@ class ElectrakActuator:
         self._fail()
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _control_message(self, control: Control, source: int, now_s: float) -> Frame:
+        self._sent_enabled = control.motion_enable
+        if control.motion_enable:
+            self._sent, self._may_move = Reading(control.target_mm, now_s), True
+        self._counters["control_n"] += 1
+        can_id = make_id(_CONTROL_PRIORITY, Pgn.PROPRIETARY_A, source, self.address)
+        return Frame(can_id, self._codec.encode_control(control))
 
     def _next_control(self, now_s: float) -> Control:
         feedback = self._track.feedback
@@ -375,7 +386,7 @@ class ElectrakActuator:
         self._faults.clear_all()
         self._track.forget()
         self._heard.clear()
-        self._sent, self._sent_enabled = None, False
+        self._sent, self._sent_enabled, self._may_move = None, False, False
         self._overload.rearm()
         self._claimed_name = None
 

@@ -37,6 +37,8 @@ def event_of(class_bits: int, data: bytes) -> BusEvent | None:
 
 FLOOD_HZ: Final = 1200.0
 """Frames a second beyond which the bus counts as flooded: about 75 % of what 250 kbit/s can carry."""
+ADDRESS_LOST_S: Final = 0.28
+"""An address that was lost and not replaced for longer is a fault. A new claim takes 0.25 s and a poll of 0.02 s."""
 _OVERRUN_SHOWN_S: Final = 2.0
 _WINDOW_S: Final = 0.5
 _LOST: Final = ("interface_down", "unplugged")
@@ -100,15 +102,15 @@ class BusHealth:
         self._faults.keep("flood", rate_hz > FLOOD_HZ, f"{rate_hz:.0f} frames a second", now_s)
         self._window_start_s, self._window_n = now_s, 0
 
-    def watch_claim(self, claimer: AddressClaimer, now_s: float) -> None:
-        """Turn the state of the address claim into conditions."""
+    def watch_claim(self, claimer: AddressClaimer, lost_for_s: float, now_s: float) -> None:
+        """Turn the state of the address claim into conditions; ``lost_for_s``: an address lost and not replaced yet."""
         address = claimer.wanted
-        lost = claimer.state is ClaimState.CANNOT_CLAIM
+        none_free = claimer.state is ClaimState.CANNOT_CLAIM
         for condition, is_present, detail in (
             (
                 "cannot_claim",
-                lost,
-                f"address {address} is taken and no other is free",
+                none_free or lost_for_s > ADDRESS_LOST_S,
+                f"address {address} is taken" + (" and no other is free" if none_free else " and so is the next"),
             ),
             ("claim_storm", claimer.storming(now_s), f"another node claims address {address} without end"),
             (

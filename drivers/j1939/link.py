@@ -3,6 +3,9 @@
 The drivers of all devices on the bus share one :class:`CanLink`. It claims our J1939 address, sends every device's
 control message on a fixed 100 ms grid, hands feedback out by source address, tells stop messages, publishes DM1, and
 opens the bus again with back-off when it was lost. What is in the messages is the drivers' own.
+
+Without an address (contended, not claimed yet) a node is to be silent. A stop is not: whatever may be in motion is told
+to end it at once, from the address that was ours last, and told again until it stands. Electraks obey any address.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Final, Protocol
@@ -46,6 +50,10 @@ class LinkUser(Protocol):
         """The control message that goes out now, from our address ``source``."""
         ...
 
+    def stop_frame(self, source: int, now_s: float) -> Frame | None:
+        """The control message that ends motion, for while we have no address; None where nothing can be moving."""
+        ...
+
     def on_feedback(self, data: bytes, now_s: float) -> None:
         """A message of the feedback group from the device's address."""
         ...
@@ -73,6 +81,8 @@ their period to some microseconds. What is left of it is spun, ten times a secon
 _BACKOFF_FIRST_S: Final = 0.1
 _BACKOFF_MAX_S: Final = 2.0
 _CLOSE_REPEATS_N: Final = 3
+_STOP_UNADDRESSED_S: Final = 2.0
+"""For so long after the address was lost, or the bus opened, motion is ended from the address that was ours last."""
 
 
 @dataclass(slots=True)
@@ -123,6 +133,10 @@ class CanLink:
         self._health = BusHealth()
         self._stop = StopWatcher(settings.stop_pgn_n, settings.stop_on_iso11783_all_stop, on_stop)
         self._port: BusPort | None = None
+        self._address: int | None = None
+        self._last_address = settings.source_address_n
+        self._unaddressed_since_s = -math.inf
+        self._address_lost_at_s: float | None = None
         self._users: dict[int, LinkUser] = {}
         self._feedback_pgns: frozenset[int] = frozenset()
         self._strangers: dict[tuple[int, int], float] = {}
@@ -156,7 +170,8 @@ class CanLink:
     def faults(self) -> tuple[DeviceFault, ...]:
         """Conditions of the bus present now, device ``can``."""
         now_s = self._clock.now_s()
-        self._health.watch_claim(self._node.claimer, now_s)
+        lost_for_s = 0.0 if self._address_lost_at_s is None else now_s - self._address_lost_at_s
+        self._health.watch_claim(self._node.claimer, lost_for_s, now_s)
         return self._health.faults(now_s)
 
     def strangers(self, pgn: int, now_s: float) -> tuple[int, ...]:
@@ -245,11 +260,32 @@ class CanLink:
         self._node.publish(dtcs, amber=bool(dtcs), red=stopped, now_s=self._clock.now_s())
 
     def _control(self, user: LinkUser) -> Frame | None:
-        """A device's control message as it is now; None while nothing can be sent."""
-        address = self._node.address
-        if self._port is None or address is None:
+        """A device's control message as it is now; None where nothing can be sent, or nothing may."""
+        if self._port is None:
             return None
-        return user.control_frame(address, self._clock.now_s())
+        now_s = self._clock.now_s()
+        if self._node.address is not None:
+            return user.control_frame(self._node.address, now_s)
+        if now_s - self._unaddressed_since_s > _STOP_UNADDRESSED_S:
+            return None
+        return user.stop_frame(self._last_address, now_s)
+
+    def _send_all_controls(self) -> None:
+        for user in tuple(self._users.values()):
+            self.send_control(user)
+
+    def _follow_address(self, now_s: float) -> None:
+        """An address lost: what moves is stopped now. One gained: what is owed goes out now, not with the next period."""
+        address = self._node.address
+        if address == self._address:
+            return
+        self._address = address
+        self._address_lost_at_s = None
+        if address is None:
+            self._unaddressed_since_s = self._address_lost_at_s = now_s
+        else:
+            self._last_address = address
+        self._send_all_controls()
 
     def _send(self, frame: Frame) -> bool:
         if self._port is None:
@@ -289,6 +325,8 @@ class CanLink:
         for item in items:
             if isinstance(item, BusEvent):
                 self._health.on_event(item, now_s)
+                if item is BusEvent.ERROR_ACTIVE:
+                    self._send_all_controls()  # what was said while nobody heard us
             else:
                 self._on_frame(item, now_s)
         self.counters.rx_n += len(items)
@@ -315,6 +353,7 @@ class CanLink:
         if pgn == Pgn.ADDRESS_CLAIMED:
             self._on_claim(frame, now_s)
         message = self._node.on_frame(frame, now_s)
+        self._follow_address(now_s)
         if message is not None:
             self._stop.on_message(message, now_s)
             for listener in self._taps.messages:
@@ -342,7 +381,9 @@ class CanLink:
                     self.counters.control_late_max_s = max(self.counters.control_late_max_s, ticker.late_s)
                     for frame in frames:
                         self._send(frame)
-                self._node.poll(self._clock.now_s())
+                now_s = self._clock.now_s()
+                self._node.poll(now_s)
+                self._follow_address(now_s)
                 self._flush()
                 tick_n += await ticker.wait()
         finally:
@@ -375,6 +416,9 @@ class CanLink:
         self._health.on_open()
         asyncio.get_running_loop().add_reader(port.fileno(), self._on_readable)
         self._node.start(now_s)
+        self._address, self._address_lost_at_s, self._unaddressed_since_s = None, None, now_s
+        self._send_all_controls()
+        self._follow_address(now_s)
         self._flush()
 
     def _on_lost(self, error: PortLostError) -> None:

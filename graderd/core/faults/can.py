@@ -54,7 +54,7 @@ ROWS = (
     FaultRow(
         "can.cannot_claim",
         "graderd has no address on the CAN bus and may not send",
-        "its address is taken by a device of higher priority, and no other is free or allowed",
+        "its address is taken by a device of higher priority, and no other is free, allowed or left to it",
         "free the address or choose another source_address_n; then arm",
         Reaction.DISARM,
     ),
