@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 from enum import StrEnum
 from typing import Final
 
@@ -17,6 +18,8 @@ class BusEvent(StrEnum):
     ERROR_PASSIVE = "error_passive"
     BUS_OFF = "bus_off"
     QUEUE_OVERRUN = "queue_overrun"
+    REFUSED = "refused"
+    """The adapter answered NACK to what it was given: a frame that did not leave, mostly."""
 
 
 def event_of(class_bits: int, data: bytes) -> BusEvent | None:
@@ -37,6 +40,9 @@ def event_of(class_bits: int, data: bytes) -> BusEvent | None:
 
 FLOOD_HZ: Final = 1200.0
 """Frames a second beyond which the bus counts as flooded: about 75 % of what 250 kbit/s can carry."""
+REFUSED_N: Final = 5
+"""NACKs of the adapter within a second that are a fault. A single one is a lost frame, and is counted."""
+_REFUSED_WINDOW_S: Final = 1.0
 ADDRESS_LOST_S: Final = 0.28
 """An address that was lost and not replaced for longer is a fault. A new claim takes 0.25 s and a poll of 0.02 s."""
 _OVERRUN_SHOWN_S: Final = 2.0
@@ -51,6 +57,7 @@ class BusHealth:
         self._faults = PresentFaults("can")
         self._window_start_s = 0.0
         self._window_n = 0
+        self._refused_s: collections.deque[float] = collections.deque(maxlen=REFUSED_N)
 
     def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """Conditions present now."""
@@ -86,6 +93,11 @@ class BusHealth:
                 self._faults.clear("bus_off", "error_passive")
             case BusEvent.QUEUE_OVERRUN:
                 self._faults.tell("queue_overrun", "received frames were lost", now_s, _OVERRUN_SHOWN_S)
+            case BusEvent.REFUSED:
+                self._refused_s.append(now_s)
+                if len(self._refused_s) == REFUSED_N and now_s - self._refused_s[0] < _REFUSED_WINDOW_S:
+                    detail = f"it answered NACK {REFUSED_N} times within a second"
+                    self._faults.tell("adapter_refuses", detail, now_s, _REFUSED_WINDOW_S)
 
     def on_transmit_full(self, detail: str, now_s: float) -> None:
         """The transmit queue was full; after a bus-off that is only its consequence."""

@@ -79,6 +79,14 @@ class BusPort:
         """Readable when frames wait or the port is lost."""
         return self._fd
 
+    def wait_ready(self, timeout_s: float) -> bool:  # noqa: ARG002  (only an adapter has to be waited for)
+        """Block until frames can be sent; False where that is not known after ``timeout_s``.
+
+        Raises:
+            PortLostError: the interface or adapter is gone.
+        """
+        return True
+
     def read(self) -> list[Frame | BusEvent]:
         """Some of the frames and events that wait, without blocking; see :attr:`pending`.
 
@@ -198,8 +206,15 @@ class SlcanPort(BusPort):
         super().__init__(bus)
         self._slcan = bus
 
+    def wait_ready(self, timeout_s: float) -> bool:
+        """As :meth:`BusPort.wait_ready`: until the adapter has opened its channel."""
+        try:
+            return self._slcan.wait_open(timeout_s)
+        except can.CanError as error:
+            raise lost_from(error) from error
+
     def read(self) -> list[Frame | BusEvent]:
-        """As :meth:`BusPort.read`, with the adapter's state lines as events."""
+        """As :meth:`BusPort.read`, with the adapter's state lines and NACKs as events."""
         out = super().read()
         while self._slcan.events:
             out.append(self._slcan.events.popleft())
@@ -215,16 +230,22 @@ class SlcanPort(BusPort):
 
 
 def from_message(message: can.Message) -> Frame | BusEvent | None:
-    """A python-can message as a frame or event; None for remote frames and error frames without news."""
+    """A python-can message as a frame or event; None for remote and FD frames, and error frames without news."""
     if message.is_error_frame:
         return event_of(message.arbitration_id, bytes(message.data))
-    if message.is_remote_frame:
+    if message.is_remote_frame or message.is_fd:  # J1939 knows neither
         return None
     return Frame(message.arbitration_id, bytes(message.data), message.is_extended_id)
 
 
+READY_S: Final = 2.5
+"""A board that resets when its port is opened takes one to two seconds to boot."""
+
+
 def open_port(settings: CanSettings) -> BusPort:
-    """Open the bus of the settings. May take some milliseconds; call it off the event loop.
+    """Open the bus of the settings; where it is an adapter that boots first, see :meth:`BusPort.wait_ready`.
+
+    May take some milliseconds; call it off the event loop.
 
     Raises:
         DeviceMissingError: no such interface or port, it is down, or this kernel has no CAN.

@@ -21,7 +21,6 @@ from graderd.drivers.j1939.ids import GLOBAL, MAX_ADDRESS, NULL, Frame, Pgn, mak
 from graderd.drivers.j1939.limiter import Limiter
 from graderd.drivers.j1939.name import Name
 
-
 VETO_S: Final = 0.25
 """Wait after a claim before other traffic (J1939-81, addresses 128 to 247)."""
 CANNOT_CLAIM_DELAY_MAX_S: Final = 0.153

@@ -20,15 +20,16 @@ from typing import Final, Protocol
 
 from graderd.drivers.j1939 import dm1
 from graderd.drivers.j1939.bus_health import BusEvent, BusHealth
-from graderd.drivers.j1939.can_port import BusPort, PortFullError, PortLostError, open_port
+from graderd.drivers.j1939.can_port import READY_S, BusPort, PortFullError, PortLostError, open_port
 from graderd.drivers.j1939.ids import GLOBAL, Frame, Pgn, destination_of, pgn_of, source_of
 from graderd.drivers.j1939.name import Name
 from graderd.drivers.j1939.node import Identity, J1939Node
+from graderd.drivers.j1939.self_reception import SelfReception
 from graderd.drivers.j1939.stop_message import StopWatcher
 from graderd.drivers.j1939.ticker import Ticker
 from graderd.drivers.j1939.transport import Message
 from graderd.hal.clock import Clock, SystemClock
-from graderd.hal.errors import DeviceError, DeviceMissingError
+from graderd.hal.errors import DeviceError, DeviceLostError, DeviceMissingError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.settings import CanSettings
 
@@ -92,6 +93,7 @@ class LinkCounters:
     rx_n: int = 0
     tx_n: int = 0
     tx_full_n: int = 0
+    refused_n: int = 0
     lost_n: int = 0
     reopened_n: int = 0
     control_late_max_s: float = 0.0
@@ -133,6 +135,7 @@ class CanLink:
         self._health = BusHealth()
         self._stop = StopWatcher(settings.stop_pgn_n, settings.stop_on_iso11783_all_stop, on_stop)
         self._port: BusPort | None = None
+        self._own = SelfReception()
         self._address: int | None = None
         self._last_address = settings.source_address_n
         self._unaddressed_since_s = -math.inf
@@ -275,7 +278,7 @@ class CanLink:
             self.send_control(user)
 
     def _follow_address(self, now_s: float) -> None:
-        """An address lost: what moves is stopped now. One gained: what is owed goes out now, not with the next period."""
+        """An address lost: what moves is stopped now. One gained: what is owed goes out now, not a period later."""
         address = self._node.address
         if address == self._address:
             return
@@ -300,6 +303,7 @@ class CanLink:
             self._on_lost(error)
             return False
         self.counters.tx_n += 1
+        self._own.on_sent(frame, self._clock.now_s())
         if self._taps.frames:
             now_s = self._clock.now_s()
             for tap in self._taps.frames:
@@ -325,6 +329,7 @@ class CanLink:
         for item in items:
             if isinstance(item, BusEvent):
                 self._health.on_event(item, now_s)
+                self.counters.refused_n += item is BusEvent.REFUSED
                 if item is BusEvent.ERROR_ACTIVE:
                     self._send_all_controls()  # what was said while nobody heard us
             else:
@@ -337,6 +342,8 @@ class CanLink:
             self._flush()
 
     def _on_frame(self, frame: Frame, now_s: float) -> None:
+        if self._own.is_echo(frame, now_s):
+            return
         for tap in self._taps.frames:
             tap(frame, now_s)
         if not frame.extended:
@@ -411,9 +418,15 @@ class CanLink:
             port = self._factory()
         else:
             port = await asyncio.to_thread(open_port, self.settings)
+            try:
+                await asyncio.to_thread(port.wait_ready, READY_S)
+            except PortLostError as error:
+                port.close()
+                raise DeviceLostError(self.where, error.detail) from error
         now_s = self._clock.now_s()
         self._port = port
         self._health.on_open()
+        self._own = SelfReception()
         asyncio.get_running_loop().add_reader(port.fileno(), self._on_readable)
         self._node.start(now_s)
         self._address, self._address_lost_at_s, self._unaddressed_since_s = None, None, now_s

@@ -22,12 +22,15 @@ from graderd.simulator.actuators.wire import Listener, Wire, WireBus
 _TICK_S: Final = 0.005
 _BUS_FAULTS: Final = (
     "adapter_hung",
+    "adapter_refuses",
+    "adapter_resets",
     "address_conflict",
     "bus_off",
     "claim_storm",
     "error_passive",
     "flood",
     "overrun",
+    "self_reception",
 )
 BusState = Literal["bus_off", "error_passive", "error_active", "overrun"]
 _STATE_LINES: Final[dict[BusState, bytes]] = {
@@ -164,7 +167,9 @@ class VirtualActuatorBus:
         Bus faults and their parameters: ``flood`` rate_hz 2000; ``address_conflict`` at_address 231: a controller
         with our own NAME; ``claim_storm`` at_address 231, rate_hz 200, wins 1: a controller who claims without end, and
         whose NAME wins (0: loses) every arbitration; ``bus_off``, ``error_passive``, ``overrun``: as the adapter or
-        kernel reports them; ``adapter_hung``: the adapter no longer reads.
+        kernel reports them; ``adapter_hung``: the adapter no longer reads; ``adapter_refuses``: it answers NACK to
+        every frame; ``adapter_resets`` boot_s 0: it forgets its channel, and from the next time its port is opened on
+        boots so long; ``self_reception``: the host gets its own frames back.
 
         Raises:
             ValueError: no such fault, or no unit at that address.
@@ -190,6 +195,8 @@ class VirtualActuatorBus:
             case "adapter_hung":
                 if self._adapter is not None:
                     self._adapter.set_deaf(True)
+            case "adapter_refuses" | "adapter_resets" | "self_reception":
+                self._disturb_adapter(fault, params.get("boot_s", 0.0))
             case "bus_off" | "error_passive" | "overrun":
                 self.report_state(fault)
 
@@ -201,6 +208,8 @@ class VirtualActuatorBus:
         self._rival = None
         if self._adapter is not None:
             self._adapter.set_deaf(False)
+            self._adapter.refusing = self._adapter.echoing = False
+            self._adapter.boot_s = 0.0
         self.report_state("error_active")
 
     def report_state(self, state: BusState) -> None:
@@ -229,6 +238,18 @@ class VirtualActuatorBus:
                     for frame in peer.advance(now_s):
                         self.wire.send(frame, self._on_rival)
             await asyncio.sleep(_TICK_S)
+
+    def _disturb_adapter(self, fault: str, boot_s: float) -> None:
+        if self._adapter is None:
+            return
+        match fault:
+            case "adapter_refuses":
+                self._adapter.refusing = True
+            case "adapter_resets":
+                self._adapter.boot_s = boot_s
+                self._adapter.reset()
+            case "self_reception":
+                self._adapter.echoing = True
 
     def _hearer_of(self, unit: VirtualElectrak) -> Listener:
         def hear(frame: Frame) -> None:

@@ -21,6 +21,13 @@ ROWS = (
         Reaction.DISARM,
     ),
     FaultRow(
+        "can.adapter_refuses",
+        "the CAN adapter does not send what it is given",
+        "it lost power for a moment and forgot its channel, its bit rate is not one it knows, or nobody acknowledges",
+        "graderd opens its channel again by itself; where that does not help, pull it and plug it in; then arm",
+        Reaction.DISARM,
+    ),
+    FaultRow(
         "can.bus_off",
         "the CAN controller has left the bus after too many errors",
         "a short circuit, a wrong bit rate somewhere, or missing terminators",
