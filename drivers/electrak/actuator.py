@@ -6,7 +6,7 @@ import asyncio
 import math
 from typing import Final
 
-from graderd.drivers.electrak.codec import Control, ElectrakCodec
+from graderd.drivers.electrak.codec import SELECTABLE_ADDRESSES, Control, ElectrakCodec
 from graderd.drivers.electrak.feedback import (
     FAILING,
     INFORMATIVE,
@@ -41,8 +41,6 @@ _WAKING_S: Final = 0.5
 """A claim so soon after our first message of a while is that of a unit which fell asleep meanwhile."""
 _CLOSE_REPEATS_N: Final = 3
 _CONTROL_PRIORITY: Final = 6
-SELECTABLE_ADDRESSES: Final = range(19, 43)
-"""An Electrak's first address is 19 (HD) or 27 (MD), to which its select wires add."""
 
 
 class ElectrakActuator:

@@ -38,6 +38,29 @@ def event_of(class_bits: int, data: bytes) -> BusEvent | None:
     return None
 
 
+ERROR_FRAMES: Final[dict[BusEvent, tuple[int, bytes]]] = {
+    BusEvent.BUS_OFF: (0x40, bytes(8)),
+    BusEvent.ERROR_PASSIVE: (0x04, bytes((0, 0x30, 0, 0, 0, 0, 128, 128))),
+    BusEvent.ERROR_ACTIVE: (0x04, bytes((0, 0x40, 0, 0, 0, 0, 0, 0))),
+    BusEvent.QUEUE_OVERRUN: (0x04, bytes((0, 0x01, 0, 0, 0, 0, 0, 0))),
+    BusEvent.REFUSED: (0x01, bytes(8)),
+}
+"""Events as error frames of the Linux kernel: class bits and data. One that was refused is a transmit timeout."""
+
+ERROR_CLASSES: Final = (
+    "transmit_timeout",
+    "arbitration_lost",
+    "controller",
+    "protocol_violation",
+    "transceiver",
+    "no_acknowledgement",
+    "bus_off",
+    "bus_error",
+    "restarted",
+    "error_counters",
+)
+"""What the bits of an error frame's identifier say, from the lowest on."""
+
 FLOOD_HZ: Final = 1200.0
 """Frames a second beyond which the bus counts as flooded: about 75 % of what 250 kbit/s can carry."""
 REFUSED_N: Final = 5

@@ -102,6 +102,7 @@ class LinkCounters:
 @dataclass(slots=True)
 class _Taps:
     frames: list[Callable[[Frame, float], None]] = field(default_factory=list)
+    events: list[Callable[[BusEvent, float], None]] = field(default_factory=list)
     messages: list[Callable[[Message, float], None]] = field(default_factory=list)
 
 
@@ -240,6 +241,11 @@ class CanLink:
         self._taps.frames.append(listener)
         return lambda: self._taps.frames.remove(listener)
 
+    def tap_events(self, listener: Callable[[BusEvent, float], None]) -> Callable[[], None]:
+        """Call ``listener`` with what the controller tells of the bus itself; returns the call that ends it."""
+        self._taps.events.append(listener)
+        return lambda: self._taps.events.remove(listener)
+
     def tap_messages(self, listener: Callable[[Message, float], None]) -> Callable[[], None]:
         """Call ``listener`` with every J1939 message, multi-packet ones included; returns the call that ends it."""
         self._taps.messages.append(listener)
@@ -329,6 +335,8 @@ class CanLink:
         for item in items:
             if isinstance(item, BusEvent):
                 self._health.on_event(item, now_s)
+                for listener in self._taps.events:
+                    listener(item, now_s)
                 self.counters.refused_n += item is BusEvent.REFUSED
                 if item is BusEvent.ERROR_ACTIVE:
                     self._send_all_controls()  # what was said while nobody heard us

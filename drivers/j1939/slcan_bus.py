@@ -146,7 +146,7 @@ class QuietSlcanBus(slcanBus):
         for line in lines:
             if line.endswith(b"\a"):
                 self._note_refusal()
-            elif not line or line in (b"z", b"Z"):
+            elif not line or bytes(line) in (b"z", b"Z"):
                 self._answers_n += 1
                 self._refused_n = 0
             else:

@@ -278,3 +278,65 @@ class Transport:
     def _control(self, destination: int, control: Control, body: bytes, pgn: int, priority: int = 7) -> Frame:
         can_id = make_id(priority, Pgn.TP_CONNECTION, self.address or 0, destination)
         return Frame(can_id, bytes((control,)) + body + pgn.to_bytes(3, "little"))
+
+
+class Listener:
+    """Puts together what others send each other, and says nothing itself. Time may be that of a log.
+
+    A session ends with its last packet, with an abort from either side, with a packet out of turn that nobody asked
+    for, or when nothing came for as long as the standard lets either side wait. The oldest of too many is forgotten.
+    """
+
+    def __init__(self) -> None:
+        self._sessions: dict[tuple[int, int], _Incoming] = {}
+
+    def on_frame(self, pgn: int, source: int, destination: int, data: bytes, now_s: float) -> Message | None:
+        """A frame of either of the protocol's two groups; the message where it is complete now."""
+        for key, session in tuple(self._sessions.items()):
+            if now_s > session.deadline_s:
+                del self._sessions[key]
+        if len(data) != 8:
+            return None
+        if pgn == Pgn.TP_DATA:
+            return self._on_data((source, destination), data, now_s)
+        about = int.from_bytes(data[5:8], "little")
+        match data[0]:
+            case Control.RTS | Control.BAM:
+                self._open((source, destination), about, data, now_s)
+            case Control.CTS:
+                asked = self._sessions.get((destination, source))
+                if asked is not None and asked.pgn == about:
+                    asked.deadline_s = now_s + (T2_S if data[1] else T4_S)
+                    if data[1] and 0 < data[2] < asked.next_n:  # asked for again
+                        asked.next_n = data[2]
+                        del asked.data[7 * (data[2] - 1) :]
+            case Control.ABORT:
+                for key in ((source, destination), (destination, source)):
+                    if key in self._sessions and self._sessions[key].pgn == about:
+                        del self._sessions[key]
+        return None
+
+    def _open(self, key: tuple[int, int], about: int, data: bytes, now_s: float) -> None:
+        size, packets_n, broadcast = int.from_bytes(data[1:3], "little"), data[3], data[0] == Control.BAM
+        self._sessions.pop(key, None)
+        if not 9 <= size <= MAX_SIZE or packets_n != math.ceil(size / 7) or broadcast != (key[1] == GLOBAL):
+            return
+        if len(self._sessions) >= MAX_SESSIONS_N:
+            del self._sessions[next(iter(self._sessions))]
+        self._sessions[key] = _Incoming(about, size, packets_n, broadcast, now_s + (T1_S if broadcast else T3_S))
+
+    def _on_data(self, key: tuple[int, int], data: bytes, now_s: float) -> Message | None:
+        session = self._sessions.get(key)
+        if session is None:
+            return None
+        if data[0] != session.next_n:
+            if session.broadcast:
+                del self._sessions[key]
+            return None
+        session.data += data[1:]
+        session.next_n += 1
+        session.deadline_s = now_s + (T1_S if session.broadcast else T3_S)
+        if session.next_n <= session.packets_n:
+            return None
+        del self._sessions[key]
+        return Message(session.pgn, *key, bytes(session.data[: session.size]))

@@ -10,6 +10,7 @@ from typing import Final, Literal
 
 import can
 
+from graderd.drivers.j1939.bus_health import ERROR_FRAMES, BusEvent
 from graderd.drivers.j1939.ids import Frame
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import DeviceMissingError
@@ -40,13 +41,12 @@ _STATE_LINES: Final[dict[BusState, bytes]] = {
     "overrun": b"e1o",
 }
 """State and error lines as the kernel's slcan driver reads them from an adapter."""
-_ERROR_FRAMES: Final[dict[BusState, tuple[int, bytes]]] = {
-    "bus_off": (0x40, bytes(8)),
-    "error_passive": (0x04, bytes((0, 0x30, 0, 0, 0, 0, 128, 128))),
-    "error_active": (0x04, bytes((0, 0x40, 0, 0, 0, 0, 0, 0))),
-    "overrun": (0x04, bytes((0, 0x01, 0, 0, 0, 0, 0, 0))),
+_EVENTS: Final[dict[BusState, BusEvent]] = {
+    "bus_off": BusEvent.BUS_OFF,
+    "error_passive": BusEvent.ERROR_PASSIVE,
+    "error_active": BusEvent.ERROR_ACTIVE,
+    "overrun": BusEvent.QUEUE_OVERRUN,
 }
-"""Error frames as the Linux kernel reports them (linux/can/error.h): class bits and data."""
 
 
 class VirtualActuatorBus:
@@ -216,7 +216,7 @@ class VirtualActuatorBus:
         """Tell the hosts a controller state: an slcan line, or a kernel-style error frame for in-process buses."""
         if self._adapter is not None:
             self._adapter.send_line(_STATE_LINES[state])
-        class_bits, data = _ERROR_FRAMES[state]
+        class_bits, data = ERROR_FRAMES[_EVENTS[state]]
         for bus in self._buses:
             bus.deliver(can.Message(arbitration_id=class_bits, data=data, is_error_frame=True, is_extended_id=False))
 
