@@ -34,7 +34,8 @@ def register(app: typer.Typer) -> None:
         """Print the bus decoded, live or from a log file.
 
         Without a source, or with the serial port that the running daemon has open, the frames come through the daemon.
-        Log files are candump, ASC, BLF or MF4. With --json one object a frame.
+        Log files are candump, ASC, BLF, MF4, TRC or CSV, also packed (.gz). With --json one object a frame; its kind
+        is data, remote, error or fd.
         """
         arguments = [argument for argument in context.args if argument != "--"]
         sources = [argument for argument in arguments if not argument.startswith("-")]

@@ -33,6 +33,13 @@ class SlcanAdapter:
         self._unsent = b""
         self._deaf = False
         self._bitrate_code = b""
+        self._booted_at_s: float | None = None
+        self.boot_s = 0.0
+        """A board that resets when its port is opened: so long after the first byte it hears nothing."""
+        self.refusing = False
+        """Whether every frame is answered NACK."""
+        self.echoing = False
+        """Whether the host gets its own frames back, as self-reception does."""
         self.dropped_n = 0
         """Frames lost because the host did not read."""
         self.commands: list[str] = []
@@ -67,7 +74,13 @@ class SlcanAdapter:
         self._terminal.close()
         self._terminal, self._master_fd = None, -1
         self._open = False
+        self._booted_at_s = None
         self._unsent = b""
+        self._line.clear()
+
+    def reset(self) -> None:
+        """Forget that the channel is open, as a board does whose supply failed for a moment."""
+        self._open = False
         self._line.clear()
 
     def set_deaf(self, deaf: bool) -> None:
@@ -116,6 +129,11 @@ class SlcanAdapter:
         try:
             data = os.read(self._master_fd, 4096)
         except (BlockingIOError, OSError):
+            return
+        now_s = asyncio.get_running_loop().time()
+        if self._booted_at_s is None:
+            self._booted_at_s = now_s + self.boot_s
+        if now_s < self._booted_at_s:
             return
         for byte in data:
             if byte == 0x0D:
@@ -169,10 +187,12 @@ class SlcanAdapter:
             data = bytes.fromhex(line[2 + digits : 2 + digits + 2 * length].decode("ascii"))
         except (ValueError, UnicodeDecodeError):
             return _ERROR
-        if not self._open or self._listen_only or length > 8:
+        if not self._open or self._listen_only or length > 8 or self.refusing:
             return _ERROR
         if line[:1] in b"tT":
             if len(data) != length:
                 return _ERROR
             self._wire.send(Frame(can_id, data, extended), self._hear)
+            if self.echoing:
+                self._write(line + _OK)
         return b"Z\r" if extended else b"z\r"

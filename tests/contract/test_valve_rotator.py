@@ -189,6 +189,10 @@ class ValveRotator:
         self._flowing = flow != 0.0
         return command(self._own.valve_n, source, flow)
 
+    def stop_frame(self, source: int, now_s: float) -> Frame | None:
+        flowed, self._flowing = self._flowing, False
+        return command(self._own.valve_n, source, 0.0) if flowed else None
+
     def on_feedback(self, data: bytes, now_s: float) -> None:
         angle_deg = int.from_bytes(data[:2], "little") / 100.0 - 180.0
         if self._angle is not None and now_s > self._angle.time_s:
