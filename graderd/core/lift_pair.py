@@ -10,7 +10,7 @@ Pure: no clock, no device; :meth:`LiftPair.step` is called every control tick wi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 from pydantic import Field
@@ -372,25 +372,27 @@ class LiftCoordinator:
         """Why both sides hold although a goal is set; empty where they do not. A new goal starts anew."""
         return self._last.stopped if self._last is not None else ""
 
-    def step(
-        self, goals: Goals, now_s: float, left: SideReading | None, right: SideReading | None
-    ) -> tuple[Goals, dict[str, float]]:
-        """Goals for this tick and the speed share of each lift (1 where not named)."""
+    @property
+    def shares(self) -> dict[str, float]:
+        """Speed share of each lift, by axis; empty where the pair is not commanded."""
+        if self._last is None:
+            return {}
+        return {"lift_left": self._last.left.speed_share, "lift_right": self._last.right.speed_share}
+
+    def step(self, goals: Goals, now_s: float, left: SideReading | None, right: SideReading | None) -> Goals:
+        """Where each lift goes in this tick on the way to ``goals``; one without the other stays."""
         if goals.lift_left_mm is None or goals.lift_right_mm is None:
             if self._targets is not None:
                 self._pair.release()
             self._targets = self._last = None
-            return replace(goals, lift_left_mm=None, lift_right_mm=None), {}
+            return Goals()
         targets = (goals.lift_left_mm, goals.lift_right_mm)
         if self._targets is not None and self.stopped and _differ(targets, self._targets):
             self._pair.release()
         self._targets = targets
         command = self._last = self._pair.step(now_s, left, right, *targets)
         self._since_s = (self._since_s or now_s) if command.condition or command.stopped else None
-        return (
-            replace(goals, lift_left_mm=command.left.target_mm, lift_right_mm=command.right.target_mm),
-            {"lift_left": command.left.speed_share, "lift_right": command.right.speed_share},
-        )
+        return Goals(lift_left_mm=command.left.target_mm, lift_right_mm=command.right.target_mm)
 
     def faults(self) -> tuple[DeviceFault, ...]:
         """``sides_apart`` while the sides are further apart than allowed, or one stopped the other."""
