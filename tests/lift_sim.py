@@ -25,6 +25,7 @@ from graderd.simulator.actuators import VirtualElectrak
 from tests.electrak_sim import Machine, SimulatedLoop
 from tests.fakes import FakeActuator, FakeEyes, FakeRotator
 
+SPEED_PERCENT: Final = Config().lift_left.speed_percent
 RENEW_S: Final = 0.1
 LOOK_S: Final = 0.01
 AT_TARGET_MM: Final = 1.6
@@ -120,8 +121,9 @@ class LiftMachine:
 @asynccontextmanager
 async def lift_machine(clock: SimulatedLoop, seed: int = 0, config: Config | None = None) -> AsyncIterator[LiftMachine]:
     """Armed and at rest."""
-    async with Machine(clock, names=LIFTS, seed=seed) as machine:
-        lifts = LiftMachine(clock, machine, config or Config())
+    config = config or Config()
+    async with Machine(clock, names=LIFTS, seed=seed, speed_percent=config.lift_left.speed_percent) as machine:
+        lifts = LiftMachine(clock, machine, config)
         running = asyncio.create_task(lifts.loop.run(), name="control")
         try:
             await asyncio.sleep(0.02 + random.Random(seed).random() * 0.2)
@@ -182,7 +184,7 @@ async def run_trial(clock: SimulatedLoop, trial: Trial) -> list[Move]:
     chance, moves = random.Random(f"{trial.seed}/moves"), []
     async with (
         lift_machine(clock, trial.seed) as lifts,
-        Machine(clock, names=("lift_left",), seed=trial.seed) as other,
+        Machine(clock, names=("lift_left",), seed=trial.seed, speed_percent=SPEED_PERCENT) as other,
     ):
         for unit, factor in zip(lifts.units.values(), trial.factors, strict=True):
             unit.behaviour.speed_factor, unit.load_n = factor, trial.load_n

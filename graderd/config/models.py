@@ -74,14 +74,27 @@ class CameraSection(CameraSettings):
     calibration: CameraCalibration = Field(default_factory=CameraCalibration)
 
 
+LIFT_SPEED = Field(
+    60,
+    ge=40,
+    le=80,
+    multiple_of=5,
+    description="motor duty in full-speed moves; at 60 % one side that sticks is 6 mm behind before its feedback says so, "
+    "at 80 % 8 mm",
+)
+
+
 class LiftLeftSection(ActuatorSettings):
     """The left lift: an Electrak HD with no address pin wired."""
+
+    speed_percent: int = LIFT_SPEED
 
 
 class LiftRightSection(ActuatorSettings):
     """The right lift: the same unit with address select 1."""
 
     address_n: int = Field(20, ge=0, le=253)
+    speed_percent: int = LIFT_SPEED
 
 
 class TiltSection(ActuatorSettings):

@@ -141,7 +141,7 @@ class Controller:
         self._state = State()
         self._faults = FaultState()
         self._gate = GateState()
-        self._lift = LiftCoordinator(settings.lift_pair)
+        self._lift = LiftCoordinator(settings.lift_pair, settings.figures)
         self._axes: Mapping[str, AxisTick] = MappingProxyType({axis: AxisTick() for axis in AXES})
         self._sending: frozenset[str] = frozenset()
         self._soil: SoilObservation | None = None
