@@ -18,6 +18,7 @@ from graderd.core import commands as cmd
 from graderd.core.axes import LIFTS
 from graderd.core.machine import Mode
 from graderd.core.tick import Tick
+from graderd.drivers.j1939.link import ACM_PERIOD_S
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
 from graderd.runtime.state_file import StateFile
@@ -25,7 +26,6 @@ from graderd.simulator.actuators import VirtualElectrak
 from tests.electrak_sim import Machine, SimulatedLoop
 from tests.fakes import FakeActuator, FakeEyes, FakeRotator
 
-SPEED_PERCENT: Final = Config().lift_left.speed_percent
 RENEW_S: Final = 0.1
 LOOK_S: Final = 0.01
 AT_TARGET_MM: Final = 1.6
@@ -51,11 +51,11 @@ class LiftMachine:
     def __init__(self, clock: SimulatedLoop, machine: Machine, config: Config) -> None:
         log: list[str] = []
         self.clock, self.machine = clock, machine
-        self.units: dict[str, VirtualElectrak] = machine.units
+        self.units: dict[str, VirtualElectrak] = {name: machine.units[name] for name in LIFTS}
         devices = Devices(
             rotation=FakeRotator("rotation", clock, 0.0, log),  # type: ignore[arg-type]
             link=machine.link,
-            actuators={**machine.axes, "tilt": FakeActuator("tilt", clock, 50.0, log)},  # type: ignore[arg-type]
+            actuators={**{name: machine.axes[name] for name in LIFTS}, "tilt": FakeActuator("tilt", clock, 50.0, log)},  # type: ignore[arg-type]
         )
         self.loop = ControlLoop(config, devices, FakeEyes(), clock, StateFile(""))
 
@@ -122,7 +122,7 @@ class LiftMachine:
 async def lift_machine(clock: SimulatedLoop, seed: int = 0, config: Config | None = None) -> AsyncIterator[LiftMachine]:
     """Armed and at rest."""
     config = config or Config()
-    async with Machine(clock, names=LIFTS, seed=seed, speed_percent=config.lift_left.speed_percent) as machine:
+    async with Machine(clock, names=(*LIFTS, "spare"), seed=seed, speed_percent=config.lift_left.speed_percent) as machine:
         lifts = LiftMachine(clock, machine, config)
         running = asyncio.create_task(lifts.loop.run(), name="control")
         try:
@@ -135,16 +135,16 @@ async def lift_machine(clock: SimulatedLoop, seed: int = 0, config: Config | Non
 
 
 class SlowSide:
-    """The slower side by itself on a bus of its own, at full speed: what the pair's time is measured by."""
+    """The slower side by itself at full speed, on the same bus: what the pair's time is measured by."""
 
     def __init__(self, clock: SimulatedLoop, machine: Machine) -> None:
-        self._clock, self._axis, self.unit = clock, machine.axes["lift_left"], machine.units["lift_left"]
+        self._clock, self._axis, self.unit = clock, machine.axes["spare"], machine.units["spare"]
 
     async def lift(self, from_mm: float, target_mm: float) -> float:
-        """Seconds from one place to the other."""
-        self.unit.position_mm = from_mm
-        await asyncio.sleep(0.5)
+        """Seconds from one place to the other; begins some control periods later, at the same point of one."""
         await self._axis.disarm()
+        self.unit.position_mm = from_mm
+        await asyncio.sleep(5 * ACM_PERIOD_S)
         await self._axis.arm()
         start_s = self._clock.now_s()
         while True:
@@ -182,15 +182,11 @@ def trials(moves_n: int, *, hitch: str = "", per_machine_n: int = 10, seed: int 
 async def run_trial(clock: SimulatedLoop, trial: Trial) -> list[Move]:
     """All moves of one machine, one after the other from where it rested."""
     chance, moves = random.Random(f"{trial.seed}/moves"), []
-    async with (
-        lift_machine(clock, trial.seed) as lifts,
-        Machine(clock, names=("lift_left",), seed=trial.seed, speed_percent=SPEED_PERCENT) as other,
-    ):
+    async with lift_machine(clock, trial.seed) as lifts:
         for unit, factor in zip(lifts.units.values(), trial.factors, strict=True):
             unit.behaviour.speed_factor, unit.load_n = factor, trial.load_n
-        slow = SlowSide(clock, other)
+        slow = SlowSide(clock, lifts.machine)
         slow.unit.behaviour.speed_factor, slow.unit.load_n = min(trial.factors), trial.load_n
-        await other.axes["lift_left"].arm()
         at_mm = 100.0
         for _ in range(trial.moves_n):
             target_mm = _target_mm(at_mm, chance)

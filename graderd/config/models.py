@@ -75,12 +75,12 @@ class CameraSection(CameraSettings):
 
 
 LIFT_SPEED = Field(
-    60,
+    50,
     ge=40,
     le=80,
     multiple_of=5,
-    description="motor duty in full-speed moves; at 60 % one side that sticks is 6 mm behind before its feedback says so, "
-    "at 80 % 8 mm",
+    description="motor duty in full-speed moves; at 50 % one side that sticks is 6 mm behind before its feedback says so, "
+    "at 80 % 9 mm",
 )
 
 

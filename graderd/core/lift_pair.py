@@ -26,13 +26,13 @@ class LiftPairSettings(Settings):
     """How closely the sides are kept together. Shares are of the lifts' ``speed_percent``."""
 
     full_speed_mm_per_s: Positive = Field(
-        40.0, le=100.0, description="guess of a lift's speed at speed share 1, until learned; no Electrak does 100"
+        33.0, le=100.0, description="guess of a lift's speed at speed share 1, until learned; no Electrak does 100"
     )
-    first_share: Positive = Field(0.5, le=1.0, description="speed share while a side's speed is still unknown")
+    first_share: Positive = Field(0.6, le=1.0, description="speed share while a side's speed is still unknown")
     approach_share: Positive = Field(
-        0.58, le=1.0, description="speed share near the target, where an Electrak slows down to 35 % duty by itself"
+        0.7, le=1.0, description="speed share near the target, where an Electrak slows down to 35 % duty by itself"
     )
-    min_share: Positive = Field(0.42, le=1.0, description="slowest speed share at which a lift moves well: 25 % duty")
+    min_share: Positive = Field(0.5, le=1.0, description="slowest speed share at which a lift moves well: 25 % duty")
     catch_up_hz: Positive = Field(
         4.0, le=8.0, description="how much slower the side ahead goes, mm/s for each mm; it would hunt with more than 8"
     )
@@ -112,6 +112,8 @@ _WAY_MM: Final = 15.0
 _TAPER: Final = 0.5
 _FIRST_CATCH_UP_HZ: Final = 6.0
 """How much faster the side behind goes while speeds are unknown, mm/s for each mm."""
+_FIRST_NOISE_MM: Final = 0.5
+"""So much the sides seem apart because one reading is older than the other."""
 _SETTLED_SHARE: Final = 0.1
 """While the acting share is estimated to be further than this from the commanded one, when it acts is a guess (the
 next control message, break-away, soft start): a gain learned then would be one of the guess."""
@@ -167,13 +169,9 @@ class _Side:
 
     @property
     def gain_mm_per_s(self) -> float | None:
-        """Speed at share 1 in the present direction; None until learned."""
-        return self._gain_towards(self.direction)
-
-    @property
-    def hint_mm_per_s(self) -> float | None:
-        """Speed at share 1 in the other direction: a first guess for this one, since wear and supply are the same."""
-        return self._gain_towards(-self.direction)
+        """Speed at share 1 in the present direction, or in the other one until that is learned: wear and supply are the
+        same. None: nothing is known."""
+        return self._gain_towards(self.direction) or self._gain_towards(-self.direction)
 
     def _gain_towards(self, direction: int) -> float | None:
         moved_mm, drive_s = self.learned.get(direction, (0.0, 0.0))
@@ -211,7 +209,7 @@ class _Side:
         near = abs(self.target_mm - self.position_mm) < _NEAR_MM or abs(self.way_mm) < _WAY_MM
         if drive_s < _MIN_DRIVE_S or near or moved_mm < 0.0:
             return
-        hint = self.hint_mm_per_s or 0.0
+        hint = self._gain_towards(-self.direction) or 0.0
         old_mm, old_s = self.learned.get(self.direction, (hint * _HINT_DRIVE_S, _HINT_DRIVE_S if hint else 0.0))
         self.learned[self.direction] = (_FORGET * old_mm + moved_mm, _FORGET * old_s + drive_s)
 
@@ -402,16 +400,12 @@ class LiftPair:
     def _first_shares(
         self, shortest_mm: float, deviations_mm: tuple[float, float]
     ) -> tuple[SideCommand, SideCommand]:
-        """Slowly, until both sides' speeds are known; in the ratio of the other direction where that one is known. The
-        side that is seen to stay behind goes faster."""
-        first = self._settings.first_share
-        hints = [side.hint_mm_per_s for side in self._sides]
-        fastest = max((hint for hint in hints if hint), default=0.0)
-        for side, hint, deviation_mm in zip(self._sides, hints, deviations_mm, strict=True):
-            guess = fastest / hint if hint and all(hints) else 1.0
-            behind_mm = max(0.0, -2.0 * deviation_mm * side.way_sign)
-            more = _FIRST_CATCH_UP_HZ * behind_mm / self._settings.full_speed_mm_per_s
-            side.share = min(1.0, first * guess * max(1.0, abs(side.way_mm) / shortest_mm) + more)
+        """Slowly, until both sides' speeds are known. The side that is seen to stay behind goes faster."""
+        settings = self._settings
+        for side, deviation_mm in zip(self._sides, deviations_mm, strict=True):
+            behind_mm = max(0.0, -2.0 * deviation_mm * side.way_sign - _FIRST_NOISE_MM)
+            more = _FIRST_CATCH_UP_HZ * behind_mm / settings.full_speed_mm_per_s
+            side.share = min(1.0, settings.first_share * max(1.0, abs(side.way_mm) / shortest_mm) + more)
         return self._commands()
 
     def _commands(self) -> tuple[SideCommand, SideCommand]:
