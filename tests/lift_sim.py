@@ -28,15 +28,18 @@ from tests.fakes import FakeActuator, FakeEyes, FakeRotator
 
 RENEW_S: Final = 0.1
 LOOK_S: Final = 0.01
+KNOWN_AFTER_MM: Final = 25.0
 AT_TARGET_MM: Final = 1.6
 """An Electrak rests up to 1.4 mm short of its target."""
 
 
 @dataclass(frozen=True)
 class Move:
-    """One move as it was seen from outside. ``apart_mm``: the most the tubes differed; ``stopped``: why it ended before
-    its goal, empty where it did not; ``faults``: the names of all that were active at any time."""
+    """One move as it was seen from outside. ``known``: the pair had moved both sides far enough before to know how fast
+    they are; ``apart_mm``: the most the tubes differed; ``stopped``: why it ended before its goal, empty where it did not;
+    ``faults``: the names of all that were active at any time."""
 
+    known: bool
     way_mm: float
     took_s: float
     own_s: float
@@ -88,12 +91,12 @@ class LiftMachine:
         reply = await self.loop.command(command)
         assert reply.accepted, reply.message
 
-    async def lift(self, target_mm: float, timeout_s: float = 40.0) -> tuple[float, float, str, frozenset[str]]:
-        """Seconds, the most the tubes differed, why it was stopped (or not), and the faults told on the way."""
+    async def follow(self, target_mm: float, timeout_s: float = 40.0) -> tuple[float, float, str, frozenset[str]]:
+        """From a jog just taken to its end: seconds, the most the tubes differed, why it was stopped (or not), and the
+        faults told on the way."""
         start_s, renewed_s, apart_mm = self.clock.now_s(), self.clock.now_s(), self.apart_mm
         faults: set[str] = set()
         stopped = ""
-        await self.jog(target_mm)
         while True:
             await asyncio.sleep(LOOK_S)
             now_s, tick = self.clock.now_s(), self.tick
@@ -114,6 +117,17 @@ class LiftMachine:
         await self.loop.command(cmd.Release(client="test"))
         return took_s, apart_mm, stopped, frozenset(faults)
 
+    async def settle(self, timeout_s: float = 40.0) -> str:
+        """Renew the jog until the tick says that both arrived; why it was stopped, empty where it was not."""
+        async with asyncio.timeout(timeout_s):
+            while True:
+                await asyncio.sleep(RENEW_S)
+                if self.tick.state.lease is None:
+                    return self.tick.state.reason
+                await self.loop.command(cmd.Renew(client="test"))
+                if all(self.tick.axes[axis].arrived for axis in LIFTS) and self.still():
+                    return ""
+
     def there(self, target_mm: float) -> bool:
         return self.still() and all(abs(u.position_mm - target_mm) < AT_TARGET_MM for u in self.units.values())
 
@@ -122,7 +136,9 @@ class LiftMachine:
 async def lift_machine(clock: SimulatedLoop, seed: int = 0, config: Config | None = None) -> AsyncIterator[LiftMachine]:
     """Armed and at rest."""
     config = config or Config()
-    async with Machine(clock, names=(*LIFTS, "spare"), seed=seed, speed_percent=config.lift_left.speed_percent) as machine:
+    async with Machine(
+        clock, names=(*LIFTS, "spare"), seed=seed, speed_percent=config.lift_left.speed_percent
+    ) as machine:
         lifts = LiftMachine(clock, machine, config)
         running = asyncio.create_task(lifts.loop.run(), name="control")
         try:
@@ -191,14 +207,16 @@ async def run_trial(clock: SimulatedLoop, trial: Trial) -> list[Move]:
         for _ in range(trial.moves_n):
             target_mm = _target_mm(at_mm, chance)
             await asyncio.sleep(0.3 + chance.random() * 0.3)
+            await lifts.jog(target_mm)
             own = asyncio.create_task(slow.lift(at_mm, target_mm), name="own")
             hitch = asyncio.create_task(_hitch(lifts, trial.hitch, chance), name="hitch")
-            took_s, apart_mm, stopped, faults = await lifts.lift(target_mm)
+            took_s, apart_mm, stopped, faults = await lifts.follow(target_mm)
             hitch.cancel()
             await asyncio.gather(hitch, return_exceptions=True)
             for unit, factor in zip(lifts.units.values(), trial.factors, strict=True):
                 unit.behaviour.speed_factor, unit.faults.silent = factor, False
-            moves.append(Move(target_mm - at_mm, took_s, await own, apart_mm, stopped, faults))
+            known = any(abs(move.way_mm) > KNOWN_AFTER_MM for move in moves)
+            moves.append(Move(known, target_mm - at_mm, took_s, await own, apart_mm, stopped, faults))
             at_mm = target_mm
             if stopped:
                 await asyncio.sleep(1.0)
@@ -232,3 +250,44 @@ async def _hitch(lifts: LiftMachine, kind: str, chance: random.Random) -> None:
             await asyncio.sleep(0.2)  # feedback comes every 105 ms: one or two are lost, never three
     finally:
         unit.behaviour.speed_factor, unit.faults.silent = factor, False
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What became of a pair that lost a side at full speed. ``held_s``: from the loss until the other was told to hold;
+    ``apart_mm``: the most they came to be apart; ``named_mm``: how far the lost side was from where it was lost when a
+    fault was told, which is ``reason``."""
+
+    held_s: float
+    apart_mm: float
+    named_mm: float
+    reason: str
+
+
+async def lose_a_side(clock: SimulatedLoop, loss: str, seed: int) -> Loss:
+    """Lift both at full speed; a fault of the simulated actuator befalls one, at any point of its feedback period."""
+    chance = random.Random(f"{seed}/{loss}")
+    async with lift_machine(clock, seed) as lifts:
+        lost, other = (lifts.units[name] for name in chance.sample(LIFTS, 2))
+        await lifts.jog(60.0)
+        await lifts.settle()
+        await lifts.jog(280.0)
+        renewing = asyncio.create_task(lifts.settle(), name="renew")
+        await asyncio.sleep(2.0 + chance.random() * 0.5)
+        from_s, from_mm, held_s = clock.now_s(), lost.position_mm, 0.0
+        if loss == "manual_override":
+            lost.manual_override = "retract"
+        else:
+            lifts.machine.bus.inject(loss, address=lost.address)
+        apart_mm, named_mm, reason = 0.0, 0.0, ""
+        while clock.now_s() - from_s < 2.0:
+            await asyncio.sleep(LOOK_S / 2)
+            if not held_s and not other.motion_enabled:
+                held_s = clock.now_s() - from_s
+            apart_mm = max(apart_mm, lifts.apart_mm)
+            if not reason and lifts.tick.state.lease is None:
+                named_mm, reason = abs(lost.position_mm - from_mm), lifts.tick.state.reason
+        lost.manual_override = None
+        renewing.cancel()
+        await asyncio.gather(renewing, return_exceptions=True)
+        return Loss(held_s, apart_mm, named_mm, reason)

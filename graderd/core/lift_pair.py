@@ -45,7 +45,10 @@ class LiftPairSettings(Settings):
         8.0, le=10.0, description="further apart than this stops both; 10 mm rack the blade's frame (0.7 degree)"
     )
     stuck_s: Positive = Field(
-        0.9, ge=0.5, le=2.0, description="a commanded side that does not move for so long is stuck; starting takes 0.4 s"
+        0.9,
+        ge=0.5,
+        le=2.0,
+        description="a commanded side that does not move for so long is stuck; starting takes 0.4 s",
     )
     silent_s: Positive = Field(
         0.14,
@@ -59,7 +62,11 @@ class LiftPairSettings(Settings):
 
     @model_validator(mode="after")
     def _order(self) -> LiftPairSettings:
-        for less, more in (("silent_s", "reading_max_age_s"), ("wait_mm", "stop_apart_mm"), ("min_share", "first_share")):
+        for less, more in (
+            ("silent_s", "reading_max_age_s"),
+            ("wait_mm", "stop_apart_mm"),
+            ("min_share", "first_share"),
+        ):
             if not getattr(self, less) < getattr(self, more):
                 raise ValueError(f"{less} ({getattr(self, less):g}) must be below {more} ({getattr(self, more):g})")
         return self
@@ -378,7 +385,7 @@ class LiftPair:
         longest_mm = max(abs(side.way_mm) for side in self._sides)
         moving = [side for side in self._sides if abs(side.way_mm) > _MOVED_MM]
         if len(moving) > 1 and any(side.gain_mm_per_s is None for side in moving):
-            return self._first_shares(min(abs(side.way_mm) for side in moving), deviations_mm)
+            return self._first_shares(longest_mm, min(abs(side.way_mm) for side in moving), deviations_mm)
         gains = [side.gain_mm_per_s or settings.full_speed_mm_per_s for side in self._sides]
         near = any(abs(side.target_mm - side.position_mm) < _NEAR_MM for side in moving)
         most_share = settings.approach_share if near and len(moving) > 1 else 1.0
@@ -398,14 +405,16 @@ class LiftPair:
         return self._commands()
 
     def _first_shares(
-        self, shortest_mm: float, deviations_mm: tuple[float, float]
+        self, longest_mm: float, shortest_mm: float, deviations_mm: tuple[float, float]
     ) -> tuple[SideCommand, SideCommand]:
         """Slowly, until both sides' speeds are known. The side that is seen to stay behind goes faster."""
         settings = self._settings
+        longest_share = min(1.0, settings.first_share * longest_mm / shortest_mm)
         for side, deviation_mm in zip(self._sides, deviations_mm, strict=True):
             behind_mm = max(0.0, -2.0 * deviation_mm * side.way_sign - _FIRST_NOISE_MM)
             more = _FIRST_CATCH_UP_HZ * behind_mm / settings.full_speed_mm_per_s
-            side.share = min(1.0, settings.first_share * max(1.0, abs(side.way_mm) / shortest_mm) + more)
+            share = longest_share * abs(side.way_mm) / longest_mm + more
+            side.share = min(max(share, settings.min_share), 1.0)
         return self._commands()
 
     def _commands(self) -> tuple[SideCommand, SideCommand]:

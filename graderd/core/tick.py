@@ -232,15 +232,10 @@ class Controller:
             frozenset(axis for axis, result in passed.items() if result.limited is not None and sensed.powered),
         )
         return MappingProxyType(
-            {
-                axis: self._axis(axis, result, sensed, pose[axis], axis in former)
-                for axis, result in passed.items()
-            }
+            {axis: self._axis(axis, result, sensed, pose[axis], axis in former) for axis, result in passed.items()}
         )
 
-    def _axis(
-        self, axis: str, passed: AxisPass, sensed: Sensed, position: float | None, moving: bool
-    ) -> AxisTick:
+    def _axis(self, axis: str, passed: AxisPass, sensed: Sensed, position: float | None, moving: bool) -> AxisTick:
         sending = axis in self._sending
         requested, refused = self._state.goals[axis], sensed.refused.get(axis, "")
         stopped = self._lift.stopped if axis in LIFTS else ""

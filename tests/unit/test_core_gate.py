@@ -323,7 +323,11 @@ def test_the_lifts_go_where_the_pair_says_inside_bounds_and_lead(axis: str) -> N
     assert pace(400.0) == 100.0 + limits.lead
     assert pace(-400.0) == 100.0 - limits.lead
     assert set(asked) == {limits.high}
-    for refused in (inputs(lease_ok=False), inputs(mode=Mode.STOPPED), inputs(pose=replace(POSE, **{FIELDS[axis]: None}))):
+    for refused in (
+        inputs(lease_ok=False),
+        inputs(mode=Mode.STOPPED),
+        inputs(pose=replace(POSE, **{FIELDS[axis]: None})),
+    ):
         _, passed = pass_gate(GateState(), goal(axis, 150.0), refused, lambda goals: Goals.of(**{axis: 150.0}))
         assert passed[axis].limited is None
 
