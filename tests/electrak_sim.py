@@ -79,8 +79,8 @@ def state(axis: ElectrakActuator) -> Lifecycle:
 
 
 class Machine:
-    """Two HD and one MD in process, a link, and their drivers; ``async with`` opens and closes everything. ``spare`` is a
-    third HD, for comparison with the two."""
+    """Two HD and one MD in process, a link, and their drivers; ``async with`` opens and closes everything. ``spare``
+    is a third HD, for comparison with the two."""
 
     NAMES = ("lift_left", "lift_right", "tilt")
 

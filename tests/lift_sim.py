@@ -36,8 +36,8 @@ AT_TARGET_MM: Final = 1.6
 @dataclass(frozen=True)
 class Move:
     """One move as it was seen from outside. ``known``: the pair had moved both sides far enough before to know how fast
-    they are; ``apart_mm``: the most the tubes differed; ``stopped``: why it ended before its goal, empty where it did not;
-    ``faults``: the names of all that were active at any time."""
+    they are; ``apart_mm``: the most the tubes differed; ``stopped``: why it ended before its goal, empty where it did
+    not; ``faults``: the names of all that were active at any time."""
 
     known: bool
     way_mm: float

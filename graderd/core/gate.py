@@ -27,7 +27,10 @@ class GateSettings(Settings):
     """The interlocks; bounds and motion limits are each axis's own figures."""
 
     rotation_min_height_mm: Finite | None = Field(
-        None, description="no rotation while the cutting edge is lower than this; None: no such interlock"
+        None,
+        ge=-1000,
+        le=1000,
+        description="no rotation while the cutting edge is lower than this; None: no such interlock",
     )
 
 

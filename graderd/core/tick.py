@@ -88,7 +88,8 @@ class AxisTick:
     """What became of one axis in this tick, in its unit.
 
     ``requested``: where it was asked to go, None: nowhere. ``limited``: what the gate passed, None: it holds;
-    ``because`` says why it is not what was asked. ``bounded``: the nearest to it that limits and window allow. ``send``: what its driver is to be told, None: nothing new; ``hold``:
+    ``because`` says why it is not what was asked. ``bounded``: the nearest to it that limits and window allow.
+    ``send``: what its driver is to be told, None: nothing new; ``hold``:
     its driver is to be told to stop. ``speed_share``: of its full speed. ``arrived``: it stands where it was *asked*
     to go.
     """

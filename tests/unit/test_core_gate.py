@@ -328,7 +328,7 @@ def test_the_lifts_go_where_the_pair_says_inside_bounds_and_lead(axis: str) -> N
         inputs(mode=Mode.STOPPED),
         inputs(pose=replace(POSE, **{FIELDS[axis]: None})),
     ):
-        _, passed = pass_gate(GateState(), goal(axis, 150.0), refused, lambda goals: Goals.of(**{axis: 150.0}))
+        _, passed = pass_gate(GateState(), goal(axis, 150.0), refused, lambda _: Goals.of(**{axis: 150.0}))
         assert passed[axis].limited is None
 
 

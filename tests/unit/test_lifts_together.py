@@ -1,6 +1,6 @@
 """The lifts through the whole tick, in virtual time: never far apart, never stopped without cause, and in good time.
 
-``GRADERD_LIFT_MOVES`` is how many moves of each kind are made (1,000 for the whole, as ``benchmarks/lift_pair.py`` does).
+``GRADERD_LIFT_MOVES`` is how many moves of each kind are made; ``benchmarks/lift_pair.py`` makes 1,000.
 """
 
 from __future__ import annotations
