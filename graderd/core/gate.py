@@ -34,6 +34,8 @@ class GateSettings(Settings):
     )
 
 
+LONGEST_STEP_S: Final = 0.1
+"""A later tick is not made up for: drivers have ended the motion meanwhile, and a goal far off would make them leap."""
 STANDING_S: Final = 0.2
 """An axis that does not follow its goal for so long stands. One that sticks and slips in soil moves again before."""
 _MOVED_SHARE: Final = 0.02
@@ -97,6 +99,7 @@ def pass_gate(
 
     ``pace_lifts``: where the lifts go in this tick, on their way to the goals that it is handed.
     """
+    dt_s = min(inputs.dt_s, LONGEST_STEP_S)
     formers = {axis: _former(state, axis, inputs) for axis in AXES}
     passed = {axis: _permit(axis, goals[axis], formers[axis], inputs) for axis in AXES}
     paced = pace_lifts(Goals.of(**{axis: passed[axis].bounded for axis in LIFTS}))
@@ -116,8 +119,8 @@ def pass_gate(
             advanced = replace(former, position=_bound(wanted, figures, former.armed_at)[0])
             setpoints[axis] = _lead(advanced, measured, figures, figures.lead)
         else:
-            advanced = _fence(_advance(former, wanted, figures, inputs.dt_s), former, figures)
-            advanced = _watch(advanced, measured, figures, inputs.dt_s)
+            advanced = _fence(_advance(former, wanted, figures, dt_s), former, figures)
+            advanced = _watch(advanced, measured, figures, dt_s)
             setpoints[axis] = _lead(advanced, measured, figures, _lead_of(advanced, figures))
         passed[axis] = replace(result, limited=setpoints[axis].position)
     return GateState(setpoints), passed
