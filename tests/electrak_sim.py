@@ -84,7 +84,8 @@ def state(axis: ElectrakActuator) -> Lifecycle:
 
 
 class Machine:
-    """Two HD and one MD in process, a link, and their drivers; ``async with`` opens and closes everything."""
+    """Two HD and one MD in process, a link, and their drivers; ``async with`` opens and closes everything. ``spare``
+    is a third HD, for comparison with the two."""
 
     NAMES = ("lift_left", "lift_right", "tilt")
 
@@ -110,6 +111,7 @@ class Machine:
             "lift_left": VirtualElectrak("electrak_hd_b017", 19, 100.0, seed),
             "lift_right": VirtualElectrak("electrak_hd_b017", 20, 100.0, seed),
             "tilt": VirtualElectrak("electrak_md_a050", 27, 50.0, seed),
+            "spare": VirtualElectrak("electrak_hd_b017", 21, 100.0, seed),
         }
         self.units = {name: all_units[name] for name in names}
         self.bus = VirtualActuatorBus(tuple(self.units.values()), clock=clock)
@@ -124,6 +126,7 @@ class Machine:
         defaults: dict[str, dict[str, Any]] = {
             "lift_left": {"address_n": 19},
             "lift_right": {"address_n": 20},
+            "spare": {"address_n": 21},
             "tilt": {"address_n": 27, "profile": "electrak_md_a050", "max_mm": 95.0, "current_limit_a": 5.0},
         }
         self.axes = {

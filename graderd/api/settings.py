@@ -38,16 +38,24 @@ class ApiLimits(Settings):
     """Bounds that keep a flood of requests from taking the control tick's time. Stop has a lane of its own."""
 
     body_max_bytes_n: int = Field(16_384, ge=256, description="largest request body and WebSocket message")
-    body_timeout_s: Positive = Field(5.0, description="a request whose body takes longer is refused")
+    body_timeout_s: Positive = Field(5.0, le=60, description="a request whose body takes longer is refused")
     connections_max_n: int = Field(128, ge=4, description="open connections; the oldest makes room for a new one")
     websockets_max_n: int = Field(16, ge=1, description="status streams and jog sockets together")
-    accept_rate_hz: Positive = Field(300.0, description="new connections taken per second; more wait in the kernel")
-    rate_hz: Positive = Field(150.0, description="requests served per second in the long run")
+    accept_rate_hz: Positive = Field(
+        300.0, le=10_000, description="new connections taken per second; more wait in the kernel"
+    )
+    rate_hz: Positive = Field(150.0, le=10_000, description="requests served per second in the long run")
     burst_n: int = Field(25, ge=1, description="requests served at once after a quiet time")
     active_n: int = Field(8, ge=1, description="requests in work at the same time")
     waiting_n: int = Field(48, ge=0, description="requests that may wait for their turn; beyond that: 503")
-    penalty_s: Positive = Field(1.0, description="a refused request is answered this much later, to slow a flood")
-    stop_rate_hz: Positive = Field(100.0, description="stop requests served per second, whatever else is going on")
+    penalty_s: Positive = Field(
+        1.0, le=10, description="a refused request is answered this much later, to slow a flood"
+    )
+    stop_rate_hz: Positive = Field(
+        100.0, ge=10, le=10_000, description="stop requests served per second, whatever else is going on"
+    )
     services_n: int = Field(2, ge=1, description="device services running at the same time")
-    command_timeout_s: Positive = Field(2.0, description="a control tick that answers later is reported as stuck")
-    stream_max_hz: Positive = Field(20.0, description="status messages per second and client")
+    command_timeout_s: Positive = Field(
+        2.0, le=10, description="a control tick that answers later is reported as stuck"
+    )
+    stream_max_hz: Positive = Field(20.0, le=200, description="status messages per second and client")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
@@ -38,11 +39,18 @@ from graderd.perception.settings import CameraCalibration, PerceptionSettings
 class ControlSettings(Settings):
     """The control tick, and how the daemon ends."""
 
-    tick_hz: float = Field(50.0, ge=10, le=200)
-    overrun_s: Positive = Field(0.1, description="a tick later than this is a fault")
-    memory_warn_mb: Positive = 600.0
+    tick_hz: float = Field(50.0, ge=10, le=200, description="decisions a second; goals expire where it is too slow")
+    overrun_s: Positive = Field(
+        0.1,
+        ge=0.02,
+        le=2.0,
+        description="a tick later than this is a fault; at 2 s the service's watchdog ends the daemon",
+    )
+    memory_warn_mb: Positive = Field(600.0, le=16_000, description="a daemon that takes more is told")
     shutdown_order: tuple[Literal["rotation", "actuators"], ...] = ("actuators", "rotation")
-    shutdown_timeout_s: Positive = Field(1.5, description="for all devices together; then the wires are dropped")
+    shutdown_timeout_s: Positive = Field(
+        1.5, le=10, description="for all devices together; then the wires are dropped; systemd waits longer"
+    )
 
     @model_validator(mode="after")
     def _order(self) -> ControlSettings:
@@ -88,14 +96,31 @@ class PluginCameraSection(PluginCameraSettings):
     calibration: CameraCalibration = Field(default_factory=CameraCalibration)
 
 
+UNSEEN_DEG = 20.0
+"""As far as between two angles of the rule."""
+LEAST_DUTY_PERCENT = 25
+"""Below that an Electrak's motor may not break away."""
+LIFT_SPEED = Field(
+    50,
+    ge=40,
+    le=80,
+    multiple_of=5,
+    description="motor duty in full-speed moves; at 50 % one side that sticks is 6 mm behind before its feedback says "
+    "so, at 80 % 9 mm",
+)
+
+
 class LiftLeftSection(ElectrakSettings):
     """The left lift: an Electrak HD with no address pin wired."""
+
+    speed_percent: int = LIFT_SPEED
 
 
 class LiftRightSection(ElectrakSettings):
     """The right lift: the same unit with address select 1."""
 
     address_n: int = Field(20, ge=0, le=253)
+    speed_percent: int = LIFT_SPEED
 
 
 class TiltSection(ElectrakSettings):
@@ -103,12 +128,12 @@ class TiltSection(ElectrakSettings):
 
     address_n: int = Field(27, ge=0, le=253)
     profile: str = "electrak_md_a050"
-    min_mm: NotNegative = 3.0
-    max_mm: Positive = 97.0
-    window_mm: Positive = 94.0
-    speed_mm_per_s: Positive = 25.0
-    acceleration_mm_per_s2: Positive = 100.0
-    lead_mm: Positive = 15.0
+    min_mm: NotNegative = Field(3.0, le=1000)
+    max_mm: Positive = Field(97.0, le=1000)
+    window_mm: Positive = Field(94.0, le=1000)
+    speed_mm_per_s: Positive = Field(25.0, le=100)
+    acceleration_mm_per_s2: Positive = Field(100.0, le=1000)
+    lead_mm: Positive = Field(15.0, ge=10, le=60)
     current_limit_a: Positive = Field(3.5, le=25.0)
 
 
@@ -183,7 +208,61 @@ class Config(Settings):
                 f"all lie within rule.vote_max_age_s ({age_s:g}): automatic operation could not decide anything. Raise "
                 f"the one or the other until their product is {needed_n - 1} or more"
             )
+        for problem in self._unkept():
+            raise ValueError(problem)
         return self
+
+    def _unkept(self) -> Iterator[str]:
+        """What a detector or a dead man needs of other settings and does not get: one line each, with its remedy."""
+        tick_s = 1.0 / self.control.tick_hz
+        rotation, pair, ticks = self.rotation, self.lift_pair, ("control.tick_hz", tick_s)
+        needs = [
+            ("machine.lease_s", self.machine.lease_s, 2, ticks),
+            ("rotation.goal_timeout_s", rotation.goal_timeout_s, 2, ticks),
+            *((f"{axis}.target_timeout_s", own.target_timeout_s, 2, ticks) for axis, own in self.actuators().items()),
+            ("control.overrun_s", self.control.overrun_s, 1, ticks),
+            ("lift_pair.silent_s", pair.silent_s, 1, ticks),
+        ]
+        blind_s = max(rotation.max_age_s, rotation.goal_timeout_s)
+        if isinstance(rotation, Ph54Settings):
+            polls = ("rotation.poll_hz", 1.0 / rotation.poll_hz)
+            needs += [
+                ("rotation.max_age_s", rotation.max_age_s, 2, polls),
+                ("rotation.reply_timeout_s", rotation.reply_timeout_s, 2, polls),
+                ("rotation.watchdog_s", rotation.watchdog_s, 2, polls),
+                ("rotation.not_moving_s", rotation.not_moving_s, 3, polls),
+            ]
+            blind_s = max(blind_s, rotation.watchdog_s)
+        for name, value_s, periods_n, (rate, period_s) in needs:
+            if value_s < periods_n * period_s - 1e-9:
+                yield (
+                    f"{name} ({value_s:g}) is shorter than {periods_n} periods of {rate} ({1.0 / period_s:g}): what it "
+                    "watches could not come in time; raise the one or the other"
+                )
+        unseen_deg = rotation.speed_deg_per_s * blind_s
+        if unseen_deg > UNSEEN_DEG:
+            yield (
+                f"rotation.speed_deg_per_s ({rotation.speed_deg_per_s:g}) with rotation.max_age_s, goal_timeout_s and "
+                f"watchdog_s lets the blade turn {unseen_deg:.0f}° with nobody watching, {UNSEEN_DEG:g}° at most; "
+                "lower the one or the others"
+            )
+        for axis, section in self.lifts().items():
+            if pair.reading_max_age_s > section.max_age_s:
+                yield (
+                    f"lift_pair.reading_max_age_s ({pair.reading_max_age_s:g}) is above {axis}.max_age_s "
+                    f"({section.max_age_s:g}): the pair would never name the side that is lost; lower it"
+                )
+            if not isinstance(section, ElectrakSettings):
+                continue
+            if pair.min_share * section.speed_percent < LEAST_DUTY_PERCENT:
+                yield (
+                    f"lift_pair.min_share ({pair.min_share:g}) of {axis}.speed_percent ({section.speed_percent}) is "
+                    f"below the {LEAST_DUTY_PERCENT} % duty at which a lift moves; raise it"
+                )
+
+    def lifts(self) -> dict[str, ActuatorSettings]:
+        """The sections of the two lifts by axis."""
+        return {"lift_left": self.lift_left, "lift_right": self.lift_right}
 
     def figures(self) -> dict[str, AxisFigures]:
         """The figures of every axis: the sections of the devices are their only source."""

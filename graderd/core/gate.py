@@ -4,17 +4,21 @@ Order of the checks, the first that fails decides: mode, lease, finite number, f
 bounds (absolute limits and the working window around the armed pose) and the motion limits (speed, acceleration, and
 how far the goal may run ahead of the measured position).
 A goal beyond a bound is not "corrected": it is limited to the bound and the result says so.
+
+Of the lifts, the speed is the lift pair's: it is asked with the goals that may be gone to, and what it says passes
+bounds and lead once more. A ramp of the gate's own on top of it was a second regulator that worked against the first.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 from pydantic import Field
 
-from graderd.core.axes import AXES, AxisFigures, Goals, Pose
+from graderd.core.axes import AXES, LIFTS, AxisFigures, Goals, Pose
 from graderd.core.machine import ARMED, Mode
 from graderd.hal.settings import Finite, Settings
 
@@ -23,17 +27,35 @@ class GateSettings(Settings):
     """The interlocks; bounds and motion limits are each axis's own figures."""
 
     rotation_min_height_mm: Finite | None = Field(
-        None, description="no rotation while the cutting edge is lower than this; None: no such interlock"
+        None,
+        ge=-1000,
+        le=1000,
+        description="no rotation while the cutting edge is lower than this; None: no such interlock",
     )
+
+
+LONGEST_STEP_S: Final = 0.1
+"""A later tick is not made up for: drivers have ended the motion meanwhile, and a goal far off would make them leap."""
+STANDING_S: Final = 0.2
+"""An axis that does not follow its goal for so long stands. One that sticks and slips in soil moves again before."""
+_MOVED_SHARE: Final = 0.02
+_STANDING_SHARE: Final = 0.2
+"""Parts of the lead: movement that is more than play and noise, and the lead that an axis which stands keeps: enough
+to be told as not moving, too little to snap far when it comes free."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setpoint:
-    """Where an axis's goal is now and how fast it moves, per second; ``armed_at`` is the middle of its window."""
+    """Where an axis's goal is now and how fast it moves, per second; ``armed_at`` is the middle of its window.
+
+    ``moved_at``: where the axis was when it last moved; ``standing_s``: since when it has not followed its goal.
+    """
 
     position: float
     speed: float
     armed_at: float
+    moved_at: float | None = None
+    standing_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,37 +81,69 @@ class GateInputs:
 
 @dataclass(frozen=True, slots=True)
 class AxisPass:
-    """What became of one axis's goal. ``limited`` None: hold. ``reason``: why it is not what was requested."""
+    """What became of one axis's goal. ``limited`` None: hold. ``reason``: why it is not what was requested.
+
+    ``bounded``: the nearest to what was requested that limits and window let it have; None where it may not move.
+    """
 
     requested: float | None
     limited: float | None
     reason: str = ""
+    bounded: float | None = None
 
 
-def pass_gate(state: GateState, goals: Goals, inputs: GateInputs) -> tuple[GateState, dict[str, AxisPass]]:
-    """Pass one tick's goals. Returns the new state and, for every axis, what may be sent."""
+def pass_gate(
+    state: GateState, goals: Goals, inputs: GateInputs, pace_lifts: Callable[[Goals], Goals] = lambda goals: goals
+) -> tuple[GateState, dict[str, AxisPass]]:
+    """Pass one tick's goals. Returns the new state and, for every axis, what may be sent.
+
+    ``pace_lifts``: where the lifts go in this tick, on their way to the goals that it is handed.
+    """
+    dt_s = min(inputs.dt_s, LONGEST_STEP_S)
+    formers = {axis: _former(state, axis, inputs) for axis in AXES}
+    passed = {axis: _permit(axis, goals[axis], formers[axis], inputs) for axis in AXES}
+    paced = pace_lifts(Goals.of(**{axis: passed[axis].bounded for axis in LIFTS}))
     setpoints: dict[str, Setpoint] = {}
-    passed: dict[str, AxisPass] = {}
     for axis in AXES:
-        requested, measured, figures = goals[axis], inputs.pose[axis], inputs.figures[axis]
-        former = state.setpoints.get(axis)
-        if inputs.mode in ARMED and former is None and measured is not None and math.isfinite(measured):
-            former = Setpoint(measured, 0.0, measured)
-        refusal = _refusal(axis, requested, measured, inputs)
-        if former is None or inputs.mode not in ARMED:
-            passed[axis] = AxisPass(requested, None, refusal)
+        result, measured, former = passed[axis], inputs.pose[axis], formers[axis]
+        if former is None:
             continue
-        if refusal or requested is None or measured is None:
+        wanted = paced[axis] if axis in LIFTS else result.bounded
+        if result.bounded is None or wanted is None or measured is None:
             # A held axis starts again from where it is measured, at rest: no jump to an old setpoint.
             at = former.position if measured is None or not math.isfinite(measured) else measured
-            setpoints[axis] = replace(former, position=at, speed=0.0)
-            passed[axis] = AxisPass(requested, None, refusal)
+            setpoints[axis] = Setpoint(at, 0.0, former.armed_at)
             continue
-        bounded, why = _bound(requested, figures, former.armed_at)
-        advanced = _fence(_advance(former, bounded, figures, inputs.dt_s), former, figures)
-        setpoints[axis] = _lead(advanced, measured, figures)
-        passed[axis] = AxisPass(requested, setpoints[axis].position, why)
+        figures = inputs.figures[axis]
+        if axis in LIFTS:
+            advanced = replace(former, position=_bound(wanted, figures, former.armed_at)[0])
+            setpoints[axis] = _lead(advanced, measured, figures, figures.lead)
+        else:
+            advanced = _fence(_advance(former, wanted, figures, dt_s), former, figures)
+            advanced = _watch(advanced, measured, figures, dt_s)
+            setpoints[axis] = _lead(advanced, measured, figures, _lead_of(advanced, figures))
+        passed[axis] = replace(result, limited=setpoints[axis].position)
     return GateState(setpoints), passed
+
+
+def _former(state: GateState, axis: str, inputs: GateInputs) -> Setpoint | None:
+    """The axis's setpoint, made from where it stands as soon as it is armed; None: there is none, it holds."""
+    if inputs.mode not in ARMED:
+        return None
+    measured = inputs.pose[axis]
+    former = state.setpoints.get(axis)
+    if former is None and measured is not None and math.isfinite(measured):
+        return Setpoint(measured, 0.0, measured)
+    return former
+
+
+def _permit(axis: str, requested: float | None, former: Setpoint | None, inputs: GateInputs) -> AxisPass:
+    """Whether the axis may move at all, and how far."""
+    refusal = _refusal(axis, requested, inputs.pose[axis], inputs)
+    if refusal or requested is None or former is None:
+        return AxisPass(requested, None, refusal)
+    bounded, why = _bound(requested, inputs.figures[axis], former.armed_at)
+    return AxisPass(requested, None, why, bounded)
 
 
 def _refusal(axis: str, requested: float | None, measured: float | None, inputs: GateInputs) -> str:
@@ -160,9 +214,23 @@ def _fence(setpoint: Setpoint, former: Setpoint, figures: AxisFigures) -> Setpoi
     return replace(setpoint, position=min(max(setpoint.position, low), high), speed=0.0)
 
 
-def _lead(setpoint: Setpoint, measured: float, figures: AxisFigures) -> Setpoint:
+def _watch(setpoint: Setpoint, measured: float, figures: AxisFigures, dt_s: float) -> Setpoint:
+    """Notice whether the axis follows its goal, or stands although it is asked to move."""
+    moved = setpoint.moved_at is None or abs(measured - setpoint.moved_at) > _MOVED_SHARE * figures.lead
+    if moved or abs(setpoint.position - measured) <= figures.tolerance:
+        return replace(setpoint, moved_at=measured, standing_s=0.0)
+    return replace(setpoint, standing_s=setpoint.standing_s + dt_s)
+
+
+def _lead_of(setpoint: Setpoint, figures: AxisFigures) -> float:
+    """How far the goal may run ahead: less and less while the axis stands, as fast as it may move."""
+    shrunk = figures.lead - figures.speed * max(0.0, setpoint.standing_s - STANDING_S)
+    return max(shrunk, _STANDING_SHARE * figures.lead, figures.tolerance)
+
+
+def _lead(setpoint: Setpoint, measured: float, figures: AxisFigures, lead: float) -> Setpoint:
     """Keep the setpoint near the measured position: what jams and comes free must not jump after a far goal."""
-    if abs(setpoint.position - measured) <= figures.lead:
+    if abs(setpoint.position - measured) <= lead:
         return setpoint
-    position = measured + math.copysign(figures.lead, setpoint.position - measured)
+    position = measured + math.copysign(lead, setpoint.position - measured)
     return replace(setpoint, position=min(max(position, figures.low), figures.high), speed=0.0)

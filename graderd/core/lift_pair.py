@@ -10,29 +10,66 @@ Pure: no clock, no device; :meth:`LiftPair.step` is called every control tick wi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Final
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from graderd.core.axes import LIFTS, Goals
+from graderd.core.axes import LIFTS, AxisFigures, Goals
 from graderd.hal.fault import DeviceFault
 from graderd.hal.settings import Positive, Settings
 
 
 class LiftPairSettings(Settings):
-    """How closely the sides are kept together."""
+    """How closely the sides are kept together. Shares are of the lifts' ``speed_percent``."""
 
-    full_speed_mm_per_s: Positive = Field(50.0, description="guess of a lift's speed at speed share 1, until learned")
-    first_share: Positive = Field(0.37, le=1.0, description="speed share while a side's speed is still unknown")
-    min_share: Positive = Field(0.32, le=1.0, description="slowest speed share at which a lift moves well")
-    catch_up_hz: Positive = Field(4.0, description="how much slower the side ahead goes, mm/s for each mm")
-    wait_mm: Positive = Field(2.85, description="the side ahead stops from here on until the other has come up")
-    level_mm: Positive = Field(0.8, description="the other has come up when it is this close")
-    apart_mm: Positive = Field(3.0, description="further apart than this is a fault")
-    stop_apart_mm: Positive = Field(6.0, description="further apart than this stops both")
-    stuck_s: Positive = Field(0.9, description="a commanded side that does not move for so long is stuck")
-    reading_max_age_s: Positive = Field(0.35, description="an older position counts as lost")
+    full_speed_mm_per_s: Positive = Field(
+        33.0, le=100.0, description="guess of a lift's speed at speed share 1, until learned; no Electrak does 100"
+    )
+    first_share: Positive = Field(0.6, le=1.0, description="speed share while a side's speed is still unknown")
+    approach_share: Positive = Field(
+        0.7, le=1.0, description="speed share near the target, where an Electrak slows down to 35 % duty by itself"
+    )
+    min_share: Positive = Field(0.5, le=1.0, description="slowest speed share at which a lift moves well: 25 % duty")
+    catch_up_hz: Positive = Field(
+        4.0, le=8.0, description="how much slower the side ahead goes, mm/s for each mm; it would hunt with more than 8"
+    )
+    wait_mm: Positive = Field(
+        2.85, le=6.0, description="the side ahead stops from here on until the other has come up; at most stop_apart_mm"
+    )
+    level_mm: Positive = Field(0.8, le=3.0, description="the other has come up when it is this close")
+    apart_mm: Positive = Field(3.0, le=6.0, description="further apart than this is a fault")
+    stop_apart_mm: Positive = Field(
+        8.0, le=10.0, description="further apart than this stops both; 10 mm rack the blade's frame (0.7 degree)"
+    )
+    stuck_s: Positive = Field(
+        0.9,
+        ge=0.5,
+        le=2.0,
+        description="a commanded side that does not move for so long is stuck; starting takes 0.4 s",
+    )
+    silent_s: Positive = Field(
+        0.14,
+        ge=0.12,
+        le=0.6,
+        description="a position older than this holds both until there is a newer one; 0.105 s are a feedback period",
+    )
+    reading_max_age_s: Positive = Field(
+        0.35, ge=0.25, le=3.0, description="an older position counts as lost and stops both; the sides hold by then"
+    )
+
+    @model_validator(mode="after")
+    def _order(self) -> LiftPairSettings:
+        for less, more in (
+            ("silent_s", "reading_max_age_s"),
+            ("wait_mm", "stop_apart_mm"),
+            ("min_share", "first_share"),
+        ):
+            if not getattr(self, less) < getattr(self, more):
+                raise ValueError(f"{less} ({getattr(self, less):g}) must be below {more} ({getattr(self, more):g})")
+        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +117,17 @@ _NEAR_MM: Final = 8.0
 _WAY_MM: Final = 15.0
 """A move shorter than this is start and end only: nothing is learned from it."""
 _TAPER: Final = 0.5
+_FIRST_CATCH_UP_HZ: Final = 6.0
+"""How much faster the side behind goes while speeds are unknown, mm/s for each mm."""
+_FIRST_NOISE_MM: Final = 0.5
+"""So much the sides seem apart because one reading is older than the other."""
 _SETTLED_SHARE: Final = 0.1
 """While the acting share is estimated to be further than this from the commanded one, when it acts is a guess (the
 next control message, break-away, soft start): a gain learned then would be one of the guess."""
 _AHEAD_N: Final = 3
 """A side is held back when it is too far ahead in so many steps; a single estimate is too noisy for that."""
+_FAR_AHEAD: Final = 1.3
+"""So many times the distance from which the side ahead waits are no noise: it is held back at once."""
 _STILL_MM_PER_S: Final = 2.0
 _PARALLEL_MM: Final = 3.0
 """Ways that differ by less are meant to be equal."""
@@ -127,17 +170,15 @@ class _Side:
 
     @property
     def direction(self) -> int:
-        return 1 if self.target_mm >= self.position_mm else -1
+        """By what was measured: an estimate may pass the target, the lift does not."""
+        at_mm = self.position_mm if self.reading is None else self.reading.position_mm
+        return 1 if self.target_mm >= at_mm else -1
 
     @property
     def gain_mm_per_s(self) -> float | None:
-        """Speed at share 1 in the present direction; None until learned."""
-        return self._gain_towards(self.direction)
-
-    @property
-    def hint_mm_per_s(self) -> float | None:
-        """Speed at share 1 in the other direction: a first guess for this one, since wear and supply are the same."""
-        return self._gain_towards(-self.direction)
+        """Speed at share 1 in the present direction, or in the other one until that is learned: wear and supply are the
+        same. None: nothing is known."""
+        return self._gain_towards(self.direction) or self._gain_towards(-self.direction)
 
     def _gain_towards(self, direction: int) -> float | None:
         moved_mm, drive_s = self.learned.get(direction, (0.0, 0.0))
@@ -162,7 +203,10 @@ class _Side:
                     self._learn(moved_mm * self.direction, drive_s - self.reading_drive_s)
             self.reading, self.reading_drive_s, self.settled = reading, drive_s, True
         gain = self.gain_mm_per_s
-        coming_mm = gain * (self.drive_s - self.reading_drive_s) if gain else 0.0
+        if gain:
+            coming_mm = gain * (self.drive_s - self.reading_drive_s)
+        else:
+            coming_mm = max(0.0, self.velocity_mm_per_s * self.direction) * max(0.0, now_s - reading.time_s)
         remaining_mm = abs(self.target_mm - reading.position_mm)
         if remaining_mm < _NEAR_MM:  # it slows down and stops by itself
             coming_mm = min(coming_mm * _TAPER, remaining_mm) if abs(self.velocity_mm_per_s) > _STILL_MM_PER_S else 0.0
@@ -172,7 +216,7 @@ class _Side:
         near = abs(self.target_mm - self.position_mm) < _NEAR_MM or abs(self.way_mm) < _WAY_MM
         if drive_s < _MIN_DRIVE_S or near or moved_mm < 0.0:
             return
-        hint = self.hint_mm_per_s or 0.0
+        hint = self._gain_towards(-self.direction) or 0.0
         old_mm, old_s = self.learned.get(self.direction, (hint * _HINT_DRIVE_S, _HINT_DRIVE_S if hint else 0.0))
         self.learned[self.direction] = (_FORGET * old_mm + moved_mm, _FORGET * old_s + drive_s)
 
@@ -180,8 +224,9 @@ class _Side:
 class LiftPair:
     """Coordinator of one pair. One object for one pair; its memory is what it learned and the move in progress."""
 
-    def __init__(self, settings: LiftPairSettings | None = None) -> None:
+    def __init__(self, settings: LiftPairSettings | None = None, max_speed_mm_per_s: float = math.inf) -> None:
         self._settings = settings or LiftPairSettings()
+        self._max_speed_mm_per_s = max_speed_mm_per_s
         self._sides = (_Side(), _Side())
         self._moving = False
         self._waiting: int | None = None
@@ -219,6 +264,8 @@ class LiftPair:
         assert right is not None
         elapsed_s = 0.0 if self._last_s is None else min(max(0.0, now_s - self._last_s), 0.2)
         self._last_s = now_s
+        if any(now_s - reading.time_s > self._settings.silent_s for reading in (left, right)):
+            return self._pause(now_s)
         for side, reading in zip(self._sides, (left, right), strict=True):
             side.drive(elapsed_s)
             side.see(reading, now_s, learn=self._moving and self._waiting is None)
@@ -243,6 +290,14 @@ class LiftPair:
         self._moving = False
         condition = "sides_apart" if self._apart_mm > self._settings.apart_mm else ""
         return PairCommand(_HOLD_BOTH.left, _HOLD_BOTH.right, self._apart_mm, condition, reason)
+
+    def _pause(self, now_s: float) -> PairCommand:
+        """Nobody knows where one side is: both hold, and go on along their line when both are measured again."""
+        for side in self._sides:
+            side.share = side.acting_share = 0.0
+            side.settled = False
+            side.moved_at_s, side.moved_from_mm = now_s, side.position_mm
+        return PairCommand(_HOLD_BOTH.left, _HOLD_BOTH.right, self._apart_mm)
 
     def _aim(self, targets_mm: tuple[float, float], now_s: float) -> None:
         """Begin a move, or bend the one in progress: the line then goes on from where the pair should be now."""
@@ -300,7 +355,7 @@ class LiftPair:
             index = 0 if ahead_mm[0] > ahead_mm[1] else 1
             far = ahead_mm[index] > settings.wait_mm and abs(self._sides[index].way_mm) > _MOVED_MM
             self._ahead_n = self._ahead_n + 1 if far else 0
-            if self._ahead_n >= _AHEAD_N:
+            if self._ahead_n >= _AHEAD_N or (far and ahead_mm[index] > _FAR_AHEAD * settings.wait_mm):
                 self._waiting = index
         else:
             behind = self._sides[1 - self._waiting]
@@ -330,10 +385,16 @@ class LiftPair:
         longest_mm = max(abs(side.way_mm) for side in self._sides)
         moving = [side for side in self._sides if abs(side.way_mm) > _MOVED_MM]
         if len(moving) > 1 and any(side.gain_mm_per_s is None for side in moving):
-            return self._first_shares(min(abs(side.way_mm) for side in moving))
+            return self._first_shares(longest_mm, min(abs(side.way_mm) for side in moving), deviations_mm)
         gains = [side.gain_mm_per_s or settings.full_speed_mm_per_s for side in self._sides]
+        near = any(abs(side.target_mm - side.position_mm) < _NEAR_MM for side in moving)
+        most_share = settings.approach_share if near and len(moving) > 1 else 1.0
         pace_mm_per_s = min(
-            (g * longest_mm / abs(s.way_mm) for g, s in zip(gains, self._sides, strict=True) if s in moving),
+            (
+                min(most_share * gain, self._max_speed_mm_per_s) * longest_mm / abs(side.way_mm)
+                for gain, side in zip(gains, self._sides, strict=True)
+                if side in moving
+            ),
             default=settings.full_speed_mm_per_s,
         )
         for side, gain, deviation_mm in zip(self._sides, gains, deviations_mm, strict=True):
@@ -343,14 +404,17 @@ class LiftPair:
             side.share = min(max(share, settings.min_share), 1.0)
         return self._commands()
 
-    def _first_shares(self, shortest_mm: float) -> tuple[SideCommand, SideCommand]:
-        """Slowly, until both sides' speeds are known; in the ratio of the other direction where that one is known."""
-        first = self._settings.first_share
-        hints = [side.hint_mm_per_s for side in self._sides]
-        fastest = max((hint for hint in hints if hint), default=0.0)
-        for side, hint in zip(self._sides, hints, strict=True):
-            guess = fastest / hint if hint and all(hints) else 1.0
-            side.share = min(1.0, first * guess * max(1.0, abs(side.way_mm) / shortest_mm))
+    def _first_shares(
+        self, longest_mm: float, shortest_mm: float, deviations_mm: tuple[float, float]
+    ) -> tuple[SideCommand, SideCommand]:
+        """Slowly, until both sides' speeds are known. The side that is seen to stay behind goes faster."""
+        settings = self._settings
+        longest_share = min(1.0, settings.first_share * longest_mm / shortest_mm)
+        for side, deviation_mm in zip(self._sides, deviations_mm, strict=True):
+            behind_mm = max(0.0, -2.0 * deviation_mm * side.way_sign - _FIRST_NOISE_MM)
+            more = _FIRST_CATCH_UP_HZ * behind_mm / settings.full_speed_mm_per_s
+            share = longest_share * abs(side.way_mm) / longest_mm + more
+            side.share = min(max(share, settings.min_share), 1.0)
         return self._commands()
 
     def _commands(self) -> tuple[SideCommand, SideCommand]:
@@ -361,8 +425,8 @@ class LiftPair:
 class LiftCoordinator:
     """Turns the two lifts' goals into what each side shall do this tick, so that they keep together."""
 
-    def __init__(self, settings: LiftPairSettings) -> None:
-        self._pair = LiftPair(settings)
+    def __init__(self, settings: LiftPairSettings, figures: Mapping[str, AxisFigures]) -> None:
+        self._pair = LiftPair(settings, min(figures[axis].speed for axis in LIFTS))
         self._targets: tuple[float, float] | None = None
         self._last: PairCommand | None = None
         self._since_s: float | None = None
@@ -372,25 +436,27 @@ class LiftCoordinator:
         """Why both sides hold although a goal is set; empty where they do not. A new goal starts anew."""
         return self._last.stopped if self._last is not None else ""
 
-    def step(
-        self, goals: Goals, now_s: float, left: SideReading | None, right: SideReading | None
-    ) -> tuple[Goals, dict[str, float]]:
-        """Goals for this tick and the speed share of each lift (1 where not named)."""
+    @property
+    def shares(self) -> dict[str, float]:
+        """Speed share of each lift, by axis; empty where the pair is not commanded."""
+        if self._last is None:
+            return {}
+        return {"lift_left": self._last.left.speed_share, "lift_right": self._last.right.speed_share}
+
+    def step(self, goals: Goals, now_s: float, left: SideReading | None, right: SideReading | None) -> Goals:
+        """Where each lift goes in this tick on the way to ``goals``; one without the other stays."""
         if goals.lift_left_mm is None or goals.lift_right_mm is None:
             if self._targets is not None:
                 self._pair.release()
             self._targets = self._last = None
-            return replace(goals, lift_left_mm=None, lift_right_mm=None), {}
+            return Goals()
         targets = (goals.lift_left_mm, goals.lift_right_mm)
         if self._targets is not None and self.stopped and _differ(targets, self._targets):
             self._pair.release()
         self._targets = targets
         command = self._last = self._pair.step(now_s, left, right, *targets)
         self._since_s = (self._since_s or now_s) if command.condition or command.stopped else None
-        return (
-            replace(goals, lift_left_mm=command.left.target_mm, lift_right_mm=command.right.target_mm),
-            {"lift_left": command.left.speed_share, "lift_right": command.right.speed_share},
-        )
+        return Goals(lift_left_mm=command.left.target_mm, lift_right_mm=command.right.target_mm)
 
     def faults(self) -> tuple[DeviceFault, ...]:
         """``sides_apart`` while the sides are further apart than allowed, or one stopped the other."""

@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
+from pydantic import Field
+
 from graderd.core import commands as cmd
 from graderd.core.axes import PARTS, Goals, Pose
 from graderd.core.faults.monitor import ActiveFault, Reaction, held_axes, worst
@@ -33,8 +35,15 @@ ARMED = (Mode.MANUAL, Mode.AUTO)
 class MachineSettings(Settings):
     """Times of the state machine."""
 
-    arm_timeout_s: Positive = 5.0
-    lease_s: Positive = 0.3
+    arm_timeout_s: Positive = Field(
+        5.0, le=30, description="arming that takes longer is given up: nothing is armed long after it was asked"
+    )
+    lease_s: Positive = Field(
+        0.3,
+        ge=0.1,
+        le=5,
+        description="motion of a client that no longer renews goes on for so long; slow emulators need 5 s",
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,15 +23,15 @@ class RuleSettings(Settings):
     more than a first one: ``switch_share`` of the soil in the new third, after ``dwell_s``.
     """
 
-    left_deg: Finite = 30.0
-    right_deg: Finite = -30.0
-    center_deg: Finite = 15.0
-    even_deg: Finite = 45.0
-    votes_needed_n: int = Field(4, ge=1, description="observations that must agree")
-    votes_window_n: int = Field(6, ge=1, description="among the newest so many")
-    vote_max_age_s: NotNegative = Field(1.5, description="older votes do not count")
+    left_deg: Finite = Field(30.0, ge=-180, le=180)
+    right_deg: Finite = Field(-30.0, ge=-180, le=180)
+    center_deg: Finite = Field(15.0, ge=-180, le=180)
+    even_deg: Finite = Field(45.0, ge=-180, le=180)
+    votes_needed_n: int = Field(4, ge=1, le=100, description="observations that must agree")
+    votes_window_n: int = Field(6, ge=1, le=100, description="among the newest so many")
+    vote_max_age_s: NotNegative = Field(1.5, le=10, description="older votes do not count: the soil has moved on")
     min_confidence: float = Field(0.3, ge=0, le=1)
-    dwell_s: NotNegative = Field(2.0, description="least time between two decisions")
+    dwell_s: NotNegative = Field(2.0, le=60, description="least time between two decisions")
     switch_share: float = Field(0.7, ge=0, le=1, description="share of soil a third needs to overturn a decision")
 
     @model_validator(mode="after")

@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 from graderd.core import commands as cmd
 from graderd.core.attitude import AttitudeGeometry, MeasuredAttitude, Preset, measured_attitude
-from graderd.core.axes import AXES, AxisFigures, Pose
+from graderd.core.axes import AXES, LIFTS, AxisFigures, Pose
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import ActiveFault, Clear, FaultState, clear_faults, update_faults
 from graderd.core.gate import AxisPass, GateInputs, GateSettings, GateState, pass_gate
@@ -90,7 +90,8 @@ class AxisTick:
     """What became of one axis in this tick, in its unit.
 
     ``requested``: where it was asked to go, None: nowhere. ``limited``: what the gate passed, None: it holds;
-    ``because`` says why it is not what was asked. ``send``: what its driver is to be told, None: nothing new; ``hold``:
+    ``because`` says why it is not what was asked. ``bounded``: the nearest to it that limits and window allow.
+    ``send``: what its driver is to be told, None: nothing new; ``hold``:
     its driver is to be told to stop. ``speed_share``: of its full speed. ``arrived``: it stands where it was *asked*
     to go.
     """
@@ -98,6 +99,7 @@ class AxisTick:
     requested: float | None = None
     limited: float | None = None
     because: str = ""
+    bounded: float | None = None
     send: float | None = None
     hold: bool = False
     speed_share: float = 1.0
@@ -142,7 +144,7 @@ class Controller:
         self._state = State()
         self._faults = FaultState()
         self._gate = GateState()
-        self._lift = LiftCoordinator(settings.lift_pair)
+        self._lift = LiftCoordinator(settings.lift_pair, settings.figures)
         self._axes: Mapping[str, AxisTick] = MappingProxyType({axis: AxisTick() for axis in AXES})
         self._sending: frozenset[str] = frozenset()
         self._soil: SoilObservation | None = None
@@ -213,12 +215,10 @@ class Controller:
         self, sensed: Sensed, intents: Intents, pose: Pose, attitude: MeasuredAttitude, dt_s: float
     ) -> Mapping[str, AxisTick]:
         """The intents through lift pair and gate; nothing else may name a goal."""
-        goals, shares = self._lift.step(
-            intents.goals, sensed.now_s, _side(sensed, "lift_left"), _side(sensed, "lift_right")
-        )
+        left, right = (_side(sensed, axis) for axis in LIFTS)
         self._gate, passed = pass_gate(
             self._gate,
-            goals,
+            intents.goals,
             GateInputs(
                 settings=self._settings.gate,
                 figures=self._settings.figures,
@@ -228,32 +228,30 @@ class Controller:
                 lease_ok=self._state.mode is Mode.AUTO or self._state.lease is not None,
                 height_mm=attitude.height_mm,
             ),
+            lambda goals: self._lift.step(goals, sensed.now_s, left, right),
         )
         former, self._sending = (
             self._sending,
             frozenset(axis for axis, result in passed.items() if result.limited is not None and sensed.powered),
         )
         return MappingProxyType(
-            {
-                axis: self._axis(axis, result, sensed, pose[axis], shares.get(axis, 1.0), axis in former)
-                for axis, result in passed.items()
-            }
+            {axis: self._axis(axis, result, sensed, pose[axis], axis in former) for axis, result in passed.items()}
         )
 
-    def _axis(
-        self, axis: str, passed: AxisPass, sensed: Sensed, position: float | None, speed_share: float, moving: bool
-    ) -> AxisTick:
+    def _axis(self, axis: str, passed: AxisPass, sensed: Sensed, position: float | None, moving: bool) -> AxisTick:
         sending = axis in self._sending
         requested, refused = self._state.goals[axis], sensed.refused.get(axis, "")
+        stopped = self._lift.stopped if axis in LIFTS else ""
         tolerance = self._settings.figures[axis].tolerance
         return AxisTick(
             requested=requested,
             limited=None if refused else passed.limited,
-            because=refused or passed.reason,
+            because=refused or stopped or passed.reason,
+            bounded=passed.bounded,
             send=passed.limited if sending else None,
             # Once: a hold renewed every tick would follow every bit of measured drift.
             hold=moving and not sending,
-            speed_share=speed_share,
+            speed_share=self._lift.shares.get(axis, 1.0),
             arrived=requested is not None and position is not None and abs(position - requested) <= tolerance,
         )
 
@@ -264,7 +262,7 @@ class Controller:
             if goal is None:
                 continue
             former, position = self._axes[axis], pose[axis]
-            at = former.limited if former.because and former.limited is not None else goal
+            at = goal if former.bounded is None else former.bounded
             if position is None or abs(position - at) > self._settings.figures[axis].tolerance:
                 return False
         return True

@@ -73,16 +73,36 @@ class RotatorSettings(Settings):
     """Blade rotation, whatever turns it."""
 
     backend: Annotated[str, _one_of("ph54")] = Field("ph54", description="driver: ph54, or package.module:NAME")
-    min_deg: Finite = Field(-60.0, description="limit at the blade, for gate and driver alike")
-    max_deg: Finite = Field(60.0, description="limit at the blade, for gate and driver alike")
-    window_deg: Positive = Field(120.0, description="largest distance from where the blade stood when it was armed")
-    speed_deg_per_s: Positive = Field(25.0, description="largest speed of the goal; the servo's profile leaves room")
-    acceleration_deg_per_s2: Positive = Field(50.0, description="largest change of that speed")
-    lead_deg: Positive = Field(10.0, description="how far the goal may run ahead of a blade that is held back")
-    tolerance_deg: Positive = Field(0.5, description="so near the goal counts as arrived")
-    max_age_s: Positive = Field(0.2, description="an older angle counts as unknown: the rotation holds")
-    goal_timeout_s: Positive = Field(0.2, description="a goal not renewed for so long becomes a hold")
-    not_moving_s: Positive = Field(0.7, description="goal ahead and no movement for so long: commanded but not moving")
+    min_deg: Finite = Field(-60.0, ge=-180, le=180, description="limit at the blade, for gate and servo alike")
+    max_deg: Finite = Field(60.0, ge=-180, le=180, description="limit at the blade, for gate and servo alike")
+    window_deg: Positive = Field(
+        120.0, le=360, description="largest distance from where the blade stood when it was armed; 360: no window"
+    )
+    speed_deg_per_s: Positive = Field(
+        25.0, le=90, description="largest speed of the goal, half the servo's own at most; its profile leaves room"
+    )
+    acceleration_deg_per_s2: Positive = Field(
+        50.0, ge=5, le=1000, description="largest change of that speed; the servo brakes with it, so not too little"
+    )
+    lead_deg: Positive = Field(
+        10.0,
+        le=20,
+        description="how far the goal may run ahead of a blade that is held back: it springs so far when freed",
+    )
+    tolerance_deg: Positive = Field(0.5, le=3, description="so near the goal counts as arrived, and as no movement")
+    max_age_s: Positive = Field(
+        0.2,
+        le=2.5,
+        description="an older angle counts as unknown: the rotation holds; 2.5 s only where it turns slowly",
+    )
+    goal_timeout_s: Positive = Field(
+        0.2,
+        le=1.0,
+        description="a goal not renewed for so long becomes a hold: the blade turns no longer after a dead tick",
+    )
+    not_moving_s: Positive = Field(
+        0.7, ge=0.3, le=5.0, description="goal ahead and no movement for so long: the motor would heat up against a jam"
+    )
 
     @model_validator(mode="after")
     def _limits(self) -> RotatorSettings:
@@ -113,16 +133,22 @@ class Ph54Settings(RotatorSettings):
     baud_n: int = Field(57_600, gt=0, description="bits per second; the factory setting of the PH54 is 57,600")
     servo_id_n: int = Field(1, ge=0, le=252)
     profile: str = Field("ph54_200_s500", description="name of the control table in firmware_profiles")
-    zero_deg: Finite = Field(0.0, description="blade angle read at the servo's zero, subtracted")
+    zero_deg: Finite = Field(
+        0.0, ge=-360, le=360, description="blade angle read at the servo's zero, subtracted; within one turn"
+    )
     sign: Literal[1, -1] = Field(1, description="-1 where the servo turns the blade the other way round")
-    gear_ratio: Positive = Field(1.0, description="servo turns for one blade turn")
+    gear_ratio: Positive = Field(
+        1.0, ge=0.1, le=20, description="servo turns for one blade turn; beyond that its angle or its speed is none"
+    )
     current_limit_a: Positive = Field(9.3, le=22.74, description="9.3 A is the continuous rating")
     watchdog_s: Positive = Field(0.2, le=2.54, description="the servo's own bus watchdog, steps of 20 ms")
     poll_hz: Positive = Field(50.0, le=200, description="telemetry reads a second")
-    reply_timeout_s: Positive = Field(0.25, description="no valid reply for so long: the servo is lost")
-    voltage_warn_low_v: Positive = 20.0
-    voltage_warn_high_v: Positive = 30.0
-    temperature_warn_c: Positive = 70.0
+    reply_timeout_s: Positive = Field(
+        0.25, le=1.5, description="no valid reply for so long: the servo is lost; its own watchdog acts before"
+    )
+    voltage_warn_low_v: Positive = Field(20.0, le=30, description="below that a warning; the servo takes 24 V")
+    voltage_warn_high_v: Positive = Field(30.0, le=35, description="above that a warning")
+    temperature_warn_c: Positive = Field(70.0, le=80, description="a warning before the servo switches off at 80 °C")
     torque_at_disarm: Literal["off", "on"] = "off"
     torque_at_exit: Literal["off", "on"] = "off"
 
@@ -167,15 +193,32 @@ class ActuatorSettings(Settings):
     backend: Annotated[str, _one_of("electrak")] = Field(
         "electrak", description="driver: electrak, or package.module:NAME"
     )
-    min_mm: NotNegative = Field(5.0, description="limit of extension, for gate and driver alike")
-    max_mm: Positive = Field(295.0, description="limit of extension, for gate and driver alike")
-    window_mm: Positive = Field(290.0, description="largest distance from where the axis stood when it was armed")
-    speed_mm_per_s: Positive = Field(60.0, description="largest speed of the goal")
-    acceleration_mm_per_s2: Positive = Field(200.0, description="largest change of that speed")
-    lead_mm: Positive = Field(30.0, description="how far the goal may run ahead of an axis that is held back")
-    tolerance_mm: Positive = Field(1.5, description="so near the goal counts as arrived; Electraks rest 1-2 mm short")
-    max_age_s: Positive = Field(0.4, description="an older position counts as unknown; feedback comes every 105 ms")
-    target_timeout_s: Positive = Field(0.3, description="a target not renewed for so long becomes a hold")
+    min_mm: NotNegative = Field(5.0, le=1000, description="limit of extension, for gate and driver alike")
+    max_mm: Positive = Field(295.0, le=1000, description="limit of extension, for gate and driver alike")
+    window_mm: Positive = Field(
+        290.0, le=1000, description="largest distance from where the axis stood when it was armed"
+    )
+    speed_mm_per_s: Positive = Field(60.0, le=100, description="largest speed of the goal; no Electrak does 100")
+    acceleration_mm_per_s2: Positive = Field(
+        200.0, le=1000, description="largest change of that speed; the lifts start softly by themselves instead"
+    )
+    lead_mm: Positive = Field(
+        30.0,
+        ge=10,
+        le=60,
+        description="how far the goal may run ahead of an axis that is held back; it moves on so far at most",
+    )
+    tolerance_mm: Positive = Field(
+        1.5, le=5, description="so near the goal counts as arrived; Electraks rest 1-2 mm short"
+    )
+    max_age_s: Positive = Field(
+        0.4, ge=0.25, le=2.5, description="an older position counts as unknown; feedback comes every 105 ms"
+    )
+    target_timeout_s: Positive = Field(
+        0.3,
+        le=1.0,
+        description="a target not renewed for so long becomes a hold: the axis moves no longer after a dead tick",
+    )
 
     @model_validator(mode="after")
     def _limits(self) -> ActuatorSettings:
@@ -191,7 +234,9 @@ class ElectrakSettings(ActuatorSettings):
     profile: str = Field("electrak_hd_b017", description="name of the layout in firmware_profiles")
     current_limit_a: Positive = Field(18.0, le=25.0)
     speed_percent: int = Field(80, ge=20, le=100, multiple_of=5, description="motor duty in full-speed moves")
-    feedback_timeout_s: Positive = Field(0.35, description="three missing feedback messages: the actuator is lost")
+    feedback_timeout_s: Positive = Field(
+        0.35, ge=0.25, le=1.0, description="three missing feedback messages: the actuator is lost"
+    )
     overload_retries_n: int = Field(0, ge=0, le=5, description="automatic retries after an overload before it latches")
     figures: dict[str, NotNegative] = Field(
         default_factory=dict,
@@ -222,8 +267,12 @@ class StopInputSettings(Settings):
     gpio_pull_down: bool = Field(True, description="gpio: the chip pulls the input down; false: a resistor does")
     poll_hz: Positive = Field(100.0, ge=10, le=1000, description="looks at the loop a second")
     open_samples_n: int = Field(2, ge=1, le=10, description="open in so many looks in a row: stop")
-    stale_s: Positive = Field(0.2, description="no look for so long: stop")
-    test_every_s: NotNegative = Field(10.0, description="test pulse that finds a short circuit; 0: none")
+    stale_s: Positive = Field(0.2, le=1.0, description="no look for so long: stop; a pressed button acts within that")
+    test_every_s: NotNegative = Field(
+        10.0,
+        le=600,
+        description="test pulse that finds a short circuit; 0: none; so long a short circuit may stay unseen",
+    )
 
     @model_validator(mode="after")
     def _port(self) -> StopInputSettings:
@@ -258,13 +307,15 @@ class CameraSettings(Settings):
     color_height_px: int = Field(800, gt=0)
     depth_width_px: int = Field(848, ge=0, description="0: colour only")
     depth_height_px: int = Field(480, ge=0)
-    rate_hz: Positive = 30.0
+    rate_hz: Positive = Field(30.0, le=90, description="pictures a second; no camera of the family gives more")
     repeat: bool = Field(False, description="start a recording or folder over at its end")
     exposure_us: Positive | None = Field(None, description="None: automatic")
     gain: Positive | None = None
     white_balance_k: Positive | None = Field(4600.0, description="None: automatic (not advised: colour would drift)")
-    stale_s: Positive = Field(0.5, description="no frame for so long: unknown at once")
-    restart_s: Positive = Field(2.0, description="no frame for so long: the worker process is restarted")
+    stale_s: Positive = Field(
+        0.5, le=60, description="no frame for so long: unknown at once; a minute only with pictures that come as slowly"
+    )
+    restart_s: Positive = Field(2.0, le=600, description="no frame for so long: the worker process is restarted")
 
 
 class PluginCameraSettings(CameraSettings):

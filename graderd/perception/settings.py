@@ -113,8 +113,10 @@ class DecisionSettings(Settings):
     )
     even_share_min_percent: Percent = Field(default=20.0, description="even: no third holds less of the soil than this")
     even_share_max_percent: Percent = Field(default=48.0, description="even: no third holds more of the soil than this")
-    max_frame_age_s: Positive = Field(default=0.1, description="a frame older than this is not judged: unknown")
-    max_angle_age_s: Positive = Field(default=0.25, description="a blade angle older than this at capture: unknown")
+    max_frame_age_s: Positive = Field(default=0.1, le=1.0, description="a frame older than this is not judged: unknown")
+    max_angle_age_s: Positive = Field(
+        default=0.25, le=1.0, description="a blade angle older than this at capture: unknown"
+    )
 
 
 class HealthSettings(Settings):
@@ -129,7 +131,7 @@ class HealthSettings(Settings):
     blurred_ratio: NotNegative = Field(
         default=0.11, description="fine over coarse contrast below which a picture is blurred"
     )
-    torn_s: Positive = Field(default=0.02, description="colour and depth taken further apart than this: torn")
+    torn_s: Positive = Field(default=0.02, le=0.5, description="colour and depth taken further apart than this: torn")
     knocked_mm: Positive = Field(
         default=75.0, description="blade found further than this from where it should be: knocked"
     )

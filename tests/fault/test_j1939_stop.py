@@ -73,7 +73,8 @@ def test_a_contention_in_mid_lift_stops_at_once_and_a_stop_during_the_new_claim_
             lost_s = loop.now_s()
             machine.bus.send(claim(OURS))
             await asyncio.sleep(0.005)
-            assert machine.link.address is None
+            without: int | None = machine.link.address
+            assert without is None
             machine.axes["lift_left"].hold()
             first_s, first = commands(machine, lost_s)[0]
             assert not enabled(first)

@@ -43,6 +43,7 @@ FOR_THE_GUEST: dict[str, object] = {
     "lift_right.max_age_s": 0.6,
     "tilt.max_age_s": 0.6,
     "control.overrun_s": 0.3,
+    "lift_pair.silent_s": 0.4,
     "lift_pair.reading_max_age_s": 0.6,
     **{
         f"{axis}.{name}": seconds

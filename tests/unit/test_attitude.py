@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import itertools
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,8 +17,6 @@ from graderd.core.attitude import (
     tilt_extension,
 )
 from graderd.core.lift_pair import LiftPair, LiftPairSettings, SideReading
-from graderd.drivers.electrak import ElectrakActuator
-from tests.electrak_sim import Machine, SimulatedLoop, run_simulated
 
 GEOMETRY = AttitudeGeometry()
 
@@ -95,6 +90,26 @@ def test_a_side_that_is_not_measured_stops_the_other_until_the_pair_is_released(
         pair.release()
 
 
+def test_both_hold_while_one_is_silent_and_go_on_when_it_is_heard() -> None:
+    pair = LiftPair()
+    pair.step(1.0, reading(100.0, 1.0), reading(100.0, 1.0), 150.0, 150.0)
+    for age_s, holds in ((0.12, False), (0.15, True), (0.34, True)):
+        command = pair.step(1.0 + age_s, reading(100.0, 1.0 + age_s), reading(100.0, 1.0), 150.0, 150.0)
+        assert [side.target_mm is None for side in (command.left, command.right)] == [holds, holds]
+        assert not command.stopped
+    command = pair.step(1.35, reading(100.0, 1.35), reading(100.0, 1.35), 150.0, 150.0)
+    assert command.left.target_mm == command.right.target_mm == 150.0
+
+
+def test_no_side_is_told_to_go_faster_than_its_axis_may() -> None:
+    pair, at_mm, now_s = LiftPair(max_speed_mm_per_s=20.0), 100.0, 0.0
+    for _ in range(200):
+        command = pair.step(now_s, reading(at_mm, now_s), reading(at_mm, now_s), 250.0, 250.0)
+        now_s, at_mm = now_s + 0.02, at_mm + 0.02 * 33.0 * command.left.speed_share
+    assert at_mm < 250.0, "it is still on its way"
+    assert command.left.speed_share * 33.0 == pytest.approx(20.0, rel=0.1)
+
+
 def test_a_side_that_does_not_move_stops_the_other() -> None:
     pair = LiftPair()
     left_mm, now_s = 100.0, 0.0
@@ -115,7 +130,7 @@ def test_sides_far_apart_are_reported_and_then_stopped() -> None:
     command = pair.step(0.1, reading(104.0, 0.1), reading(100.0, 0.1), 200.0, 200.0)
     assert command.condition == "sides_apart"
     assert command.apart_mm == pytest.approx(4.0)
-    command = pair.step(0.2, reading(107.0, 0.2), reading(100.0, 0.2), 200.0, 200.0)
+    command = pair.step(0.2, reading(109.0, 0.2), reading(100.0, 0.2), 200.0, 200.0)
     assert command.stopped
 
 
@@ -148,147 +163,10 @@ def test_only_one_side_moving_is_a_move_as_well() -> None:
     )
 )
 def test_whatever_it_is_shown_its_commands_are_in_range(steps: list[tuple[float, float, float, float, float]]) -> None:
-    pair, now_s = LiftPair(LiftPairSettings(stop_apart_mm=1e9)), 0.0
+    pair, now_s = LiftPair(LiftPairSettings(stop_apart_mm=10.0)), 0.0
     for left_mm, right_mm, left_target_mm, right_target_mm, wait_s in steps:
         now_s += wait_s
         command = pair.step(now_s, reading(left_mm, now_s), reading(right_mm, now_s), left_target_mm, right_target_mm)
         for side in (command.left, command.right):
             assert 0.0 < side.speed_share <= 1.0
             assert side.target_mm is None or abs(side.target_mm) < 1e6
-
-
-# -- the pair with the real driver and virtual actuators --------------------------------------------------------------
-
-
-class Lift:
-    """Drives the pair as the control tick does and watches the true positions."""
-
-    def __init__(self, machine: Machine, loop: SimulatedLoop) -> None:
-        self.machine, self.loop, self.pair = machine, loop, LiftPair()
-        self.worst_apart_mm = 0.0
-        self.stopped = ""
-
-    async def arm(self) -> None:
-        for axis in self.machine.axes.values():
-            await axis.arm()
-
-    async def go(self, left_mm: float, right_mm: float | None = None, *, timeout_s: float = 15.0) -> float:
-        """Seconds until both stand at their targets (the right one's is the left one's where not given)."""
-        self.pair.release()
-        self.worst_apart_mm, start_s = 0.0, self.loop.now_s()
-        targets_mm = (left_mm, left_mm if right_mm is None else right_mm)
-        left, right = (self.machine.units[name] for name in ("lift_left", "lift_right"))
-        axes = [self.machine.axes[name] for name in ("lift_left", "lift_right")]
-        while self.loop.now_s() - start_s < timeout_s:
-            now_s, (left_seen, right_seen) = self.loop.now_s(), (self._reading(axis) for axis in axes)
-            command = self.pair.step(now_s, left_seen, right_seen, *targets_mm)
-            self.stopped = command.stopped
-            for axis, side in zip(axes, (command.left, command.right), strict=True):
-                if side.target_mm is None:
-                    axis.hold()
-                else:
-                    axis.set_target_mm(side.target_mm, side.speed_share)
-            await asyncio.sleep(0.02)
-            self.worst_apart_mm = max(self.worst_apart_mm, abs(left.position_mm - right.position_mm))
-            there = (abs(u.position_mm - t) < 1.6 for u, t in zip((left, right), targets_mm, strict=True))
-            if self.stopped or (all(there) and not left.velocity_mm_per_s and not right.velocity_mm_per_s):
-                break
-        return self.loop.now_s() - start_s
-
-    @staticmethod
-    def _reading(axis: ElectrakActuator) -> SideReading | None:
-        position = axis.telemetry().position_mm
-        return None if position is None else SideReading(position.value, position.time_s)
-
-
-async def alone(machine: Machine, loop: SimulatedLoop, name: str, target_mm: float) -> float:
-    """Seconds one side takes by itself."""
-    start_s, unit = loop.now_s(), machine.units[name]
-    while loop.now_s() - start_s < 15.0:
-        machine.axes[name].set_target_mm(target_mm)
-        await asyncio.sleep(0.02)
-        if abs(unit.position_mm - target_mm) < 1.6 and not unit.velocity_mm_per_s:
-            break
-    return loop.now_s() - start_s
-
-
-@pytest.mark.parametrize(
-    ("slow", "load_n", "seed"),
-    [
-        *itertools.product(("lift_left", "lift_right"), (0.0, 800.0), (1, 2)),
-        # here the first messages of a move fell so that its start-up was taken for a slow side
-        ("lift_left", 400.0, 16), ("lift_left", 800.0, 4), ("lift_left", 800.0, 23),
-        ("lift_right", 0.0, 27), ("lift_right", 0.0, 36), ("lift_right", 400.0, 22), ("lift_left", 0.0, 51),
-    ],
-)  # fmt: skip
-def test_a_100_mm_lift_with_one_side_30_percent_slower(slow: str, load_n: float, seed: int) -> None:
-    """Never more than 3 mm apart, within 15 % of the slow side's own time: the first lift, and a later one."""
-
-    async def main(loop: SimulatedLoop) -> None:
-        async with Machine(loop, names=("lift_left", "lift_right"), seed=seed) as machine:
-            for unit in machine.units.values():
-                unit.load_n = load_n
-            machine.units[slow].behaviour.speed_factor = 0.7
-            lift = Lift(machine, loop)
-            await asyncio.sleep(0.037 * seed)
-            await lift.arm()
-            own_s = {200.0: await alone(machine, loop, slow, 200.0), 100.0: await alone(machine, loop, slow, 100.0)}
-            for unit in machine.units.values():
-                unit.position_mm = 100.0
-            await asyncio.sleep(0.6)
-            await machine.axes["lift_left"].disarm()
-            await machine.axes["lift_right"].disarm()
-            await lift.arm()
-            for target_mm in (200.0, 100.0, 200.0):
-                took_s = await lift.go(target_mm)
-                assert lift.stopped == ""
-                assert lift.worst_apart_mm <= 3.0
-                assert took_s <= 1.15 * own_s[target_mm]
-
-    run_simulated(main)
-
-
-@pytest.mark.parametrize("fault", ["stuck", "silence", "power_cut"])
-def test_a_stuck_or_lost_side_stops_the_other_in_mid_lift(fault: str) -> None:
-    async def main(loop: SimulatedLoop) -> None:
-        async with Machine(loop, names=("lift_left", "lift_right")) as machine:
-            lift = Lift(machine, loop)
-            await lift.arm()
-            going = asyncio.create_task(lift.go(250.0), name="lift")
-            await asyncio.sleep(1.2)
-            if fault == "stuck":
-                machine.units["lift_right"].behaviour.speed_factor = 0.0
-            else:
-                machine.bus.inject(fault, address=20)
-            await going
-            assert lift.stopped
-            left = machine.units["lift_left"]
-            await asyncio.sleep(0.3)
-            assert left.velocity_mm_per_s == 0.0
-            assert left.position_mm < 250.0
-
-    run_simulated(main)
-
-
-@pytest.mark.parametrize("slow", [None, "lift_left", "lift_right"])
-def test_level_and_slope_moves_in_a_row_all_arrive(slow: str | None) -> None:
-    """Ways of 6:1, against each other, one side only: every one ends at its targets, none is stopped."""
-
-    async def main(loop: SimulatedLoop) -> None:
-        async with Machine(loop, names=("lift_left", "lift_right")) as machine:
-            if slow:
-                machine.units[slow].behaviour.speed_factor = 0.7
-            lift = Lift(machine, loop)
-            await lift.arm()
-            errors_mm = []
-            for left_mm, right_mm in (
-                (160, 110), (100, 100), (130, 70), (100, 100), (200, 195), (100, 104), (100, 150), (120, 150), (5, 295)
-            ):  # fmt: skip
-                took_s = await lift.go(left_mm, right_mm)
-                assert lift.stopped == ""
-                assert took_s < 12.0
-                errors_mm.append(abs(machine.units["lift_left"].position_mm - left_mm))
-                errors_mm.append(abs(machine.units["lift_right"].position_mm - right_mm))
-            assert max(errors_mm) < 1.6
-
-    run_simulated(main)

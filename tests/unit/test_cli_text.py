@@ -7,6 +7,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import can
 import httpx
 import pytest
 from rich.console import Console
@@ -16,7 +17,6 @@ from graderd.cli.console import error_line, plain_table, print_json, print_text,
 from graderd.cli.status import summary
 from graderd.core.machine import Mode
 from graderd.drivers.electrak.dump import FrameDecoder, text_of
-from graderd.drivers.j1939.ids import Frame
 from graderd.runtime.sd_notify import SystemdNotifier
 from harness.api_daemon import serving, within
 from tests.unit.test_cli_modes import Capture, cli
@@ -77,8 +77,8 @@ async def test_the_command_line_trusts_no_daemon_either(tmp_path: Path, capsys: 
 
 
 def test_a_unit_on_the_bus_does_not_command_the_terminal_of_who_dumps_it() -> None:
-    frame = Frame((6 << 26) | (0xFEDA << 8) | 0x13, b"\x01\x1b[2J\n\x07*", True)
-    assert_harmless(text_of(FrameDecoder().decode(frame, 0.0)), 1)
+    frame = can.Message(arbitration_id=(6 << 26) | (0xFEDA << 8) | 0x13, data=b"\x01\x1b[2J\n\x07*")
+    assert_harmless(text_of(FrameDecoder().decode(frame)), 1)
 
 
 def test_systemd_is_told_one_assignment(monkeypatch: pytest.MonkeyPatch) -> None:

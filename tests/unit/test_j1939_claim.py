@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -109,7 +111,11 @@ def test_requests_for_claims_are_answered() -> None:
 
 def test_a_claim_that_is_owed_is_put_off_and_never_dropped() -> None:
     """Else the one who asked, or who claimed our address with a higher NAME, believes that it is free."""
-    for ask in (lambda c, t: c.on_request(t), lambda c, t: c.on_claim(231, HIGHER, t)):
+    asks: tuple[Callable[[AddressClaimer, float], list[Frame]], ...] = (
+        lambda c, t: c.on_request(t),
+        lambda c, t: c.on_claim(231, HIGHER, t),
+    )
+    for ask in asks:
         claimer = claimed()
         for _ in range(8):
             claimer.on_request(1.0)

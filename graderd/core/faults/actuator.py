@@ -167,6 +167,7 @@ ROWS = (
         "free the slow side, then level the blade with 'graderd jog slope =0deg'",
         # The lifts stop by themselves where one lags; holding the axis would forbid the very move that levels it.
         Reaction.RETREAT,
+        debounce_s=0.2,
         axes=NO_AXIS,
     ),
 )
