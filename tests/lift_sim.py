@@ -197,7 +197,8 @@ def trials(moves_n: int, *, hitch: str = "", per_machine_n: int = 10, seed: int 
 
 async def run_trial(clock: SimulatedLoop, trial: Trial) -> list[Move]:
     """All moves of one machine, one after the other from where it rested."""
-    chance, moves = random.Random(f"{trial.seed}/moves"), []
+    moves: list[Move] = []
+    chance = random.Random(f"{trial.seed}/moves")
     async with lift_machine(clock, trial.seed) as lifts:
         for unit, factor in zip(lifts.units.values(), trial.factors, strict=True):
             unit.behaviour.speed_factor, unit.load_n = factor, trial.load_n

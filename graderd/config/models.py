@@ -213,9 +213,9 @@ class Config(Settings):
         unseen_deg = rotation.speed_deg_per_s * max(rotation.max_age_s, rotation.goal_timeout_s, rotation.watchdog_s)
         if unseen_deg > UNSEEN_DEG:
             yield (
-                f"rotation.speed_deg_per_s ({rotation.speed_deg_per_s:g}) with rotation.max_age_s, goal_timeout_s and "
-                f"watchdog_s lets the blade turn {unseen_deg:.0f}° with nobody watching, {UNSEEN_DEG:g}° at most; lower "
-                "the one or the others"
+                f"rotation.speed_deg_per_s ({rotation.speed_deg_per_s:g}) with rotation.max_age_s, goal_timeout_s "
+                f"and watchdog_s lets the blade turn {unseen_deg:.0f}° with nobody watching, "
+                f"{UNSEEN_DEG:g}° at most: lower the one or the others"
             )
         for axis, section in self.lifts().items():
             if pair.reading_max_age_s > section.max_age_s:

@@ -124,7 +124,7 @@ def pass_gate(
             setpoints[axis] = _lead(advanced, measured, figures, figures.lead)
         else:
             advanced = _fence(_advance(former, wanted, figures, dt_s), former, figures)
-            advanced = _watch(advanced, measured, figures, dt_s)
+            advanced = _watch(advanced, measured, figures, inputs.dt_s)
             setpoints[axis] = _lead(advanced, measured, figures, _lead_of(advanced, figures))
         passed[axis] = replace(result, limited=setpoints[axis].position)
     return GateState(setpoints), passed

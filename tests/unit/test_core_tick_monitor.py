@@ -351,7 +351,8 @@ class World:
                         cmd.Arm(client=client), cmd.Disarm(client=client), cmd.Stop(client=client), self._jog(),
                         cmd.Reset(client=client, stop_n=max(0, self.stop_n - chance.choice((0, 0, 1)))),
                         cmd.Auto(client=client), cmd.Manual(client=client), cmd.Renew(client=client),
-                        cmd.Release(client=client), cmd.Preset(client=client, name=chance.choice(tuple(CONFIG.presets))),
+                        cmd.Release(client=client),
+                        cmd.Preset(client=client, name=chance.choice(tuple(CONFIG.presets))),
                     )
                 )
             )  # fmt: skip
