@@ -26,9 +26,10 @@ def describe(moves: list[Move]) -> str:
     known = sorted(move.took_s / move.own_s for move in moves if move.known)
     return (
         f"apart at most {max(move.apart_mm for move in moves):.2f} mm, stopped {sum(bool(m.stopped) for m in moves)}, "
-        f"sides_apart told in {sum(bool(move.faults) for move in moves)}; times the slow side's own: "
+        f"faults told in {sum(bool(move.faults) for move in moves)}; times the slow side's own: "
         f"median {statistics.median(ratios):.2f}, 99 in 100 {ratios[int(0.99 * (len(ratios) - 1))]:.2f}, most "
-        f"{ratios[-1]:.2f} ({max(known, default=0.0):.2f} once the speeds are known), over {IN_TIME:g}: {sum(r > IN_TIME for r in ratios)}"
+        f"{ratios[-1]:.2f} ({max(known, default=0.0):.2f} once the speeds are known), "
+        f"over {IN_TIME:g}: {sum(r > IN_TIME for r in ratios)}"
     )
 
 
