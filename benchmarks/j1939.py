@@ -27,7 +27,7 @@ from typing import Any
 
 from graderd.drivers.electrak.codec import Control, ElectrakCodec, load_database
 from graderd.drivers.j1939.can_port import BusPort, SlcanPort
-from graderd.drivers.j1939.ids import Frame
+from graderd.drivers.j1939.ids import Frame, Pgn, make_id
 from graderd.drivers.j1939.link import CanLink
 from graderd.drivers.j1939.slcan_bus import QuietSlcanBus
 from graderd.hal.settings import CanSettings
@@ -75,14 +75,17 @@ class Axis:
     """What the link wants of an actuator, reduced to the codec."""
 
     address = 0x13
+    feedback_pgn = Pgn.PROPRIETARY_A2
 
     def __init__(self) -> None:
         self._codec = ElectrakCodec("electrak_hd")
         self._control = Control(150.0, 18.0, 80.0, motion_enable=True)
         self.heard_n = 0
 
-    def control_data(self, _now_s: float) -> bytes:
-        return self._codec.encode_control(self._control)
+    def control_frame(self, source: int, _now_s: float) -> Frame:
+        return Frame(make_id(6, Pgn.PROPRIETARY_A, source, self.address), self._codec.encode_control(self._control))
+
+    def stop_frame(self, source: int, now_s: float) -> Frame | None: ...
 
     def on_feedback(self, data: bytes, _now_s: float) -> None:
         self._codec.decode_feedback(data)

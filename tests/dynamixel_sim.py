@@ -15,11 +15,13 @@ from typing import Any
 
 import pytest
 
+from graderd.config import Config
+from graderd.core.plausibility import PlausibilityMonitor, axis_sample, motion_figures
 from graderd.drivers.dynamixel import Ph54Rotator
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 
 PATIENCE_S = 15.0
 """Deadline of waits in tests: long, because the machine may be busy; nothing is measured by it."""
@@ -27,15 +29,19 @@ PATIENCE_S = 15.0
 
 @dataclass
 class Bench:
-    """A rotator and the virtual servo it drives."""
+    """A rotator and the virtual servo it drives, with the daemon's judgement of its motion."""
 
     rotator: Ph54Rotator
     servo: VirtualServo
     bus: VirtualServoBus
     clock: AwakeClock
+    monitor: PlausibilityMonitor
 
     def conditions(self) -> set[str]:
-        return {f.condition for f in self.rotator.faults()}
+        """What the driver tells, and what the readings say about the motion."""
+        sample = axis_sample("rotation", self.rotator.lifecycle, self.rotator.telemetry())
+        judged = self.monitor.judge(() if sample is None else (sample,), self.clock.now_s())
+        return {f.condition for f in (*self.rotator.faults(), *judged)}
 
     async def until(self, met: Callable[[], object], what: str = "", timeout_s: float = PATIENCE_S) -> None:
         """Wait until ``met()`` is true, looking every few milliseconds."""
@@ -111,13 +117,14 @@ async def bench(
     clock = AwakeClock()
     bus = VirtualServoBus([servo], folder / "servo", clock=clock, **(wire or {}))
     brisk = {"speed_deg_per_s": 50.0, "acceleration_deg_per_s2": 200.0}  # so that tests need not wait for the blade
-    settings = RotatorSettings(**{"port": str(folder / "servo"), **brisk, **changes})
+    settings = Ph54Settings(**{"port": str(folder / "servo"), **brisk, **changes})
     rotator = Ph54Rotator(settings, clock=clock)
     await bus.start()
     try:
         if opened:
             await rotator.open()
-        yield Bench(rotator, servo, bus, clock)
+        figures = Config(rotation=settings).figures()
+        yield Bench(rotator, servo, bus, clock, PlausibilityMonitor(motion_figures(settings, figures)))
     finally:
         await rotator.close()
         await bus.close()

@@ -7,10 +7,15 @@ import selectors
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
+from graderd.config import Config
+from graderd.core.faults.catalogue import CATALOGUE
+from graderd.core.faults.monitor import Reaction, row_for
+from graderd.core.plausibility import PlausibilityMonitor, axis_sample, motion_figures
 from graderd.drivers.electrak import CanLink, ElectrakActuator
 from graderd.drivers.j1939.can_port import BusPort
+from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.settings import ActuatorSettings, CanSettings
+from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 
 T = TypeVar("T")
@@ -93,9 +98,14 @@ class Machine:
         open_axes: bool = True,
         seed: int = 0,
         on_stop: Callable[[str], None] | None = None,
+        watched: bool = False,
         **changes: Any,
     ) -> None:
+        """``watched``: a task judges the motion every 20 ms and disarms where the catalogue says so, as the daemon."""
         self.clock = clock
+        self.judged: tuple[DeviceFault, ...] = ()
+        self._watched = watched
+        self._watch_task: asyncio.Task[None] | None = None
         self._open_axes = open_axes
         all_units = {
             "lift_left": VirtualElectrak("electrak_hd_b017", 19, 100.0, seed),
@@ -120,7 +130,7 @@ class Machine:
             "tilt": {"address_n": 27, "profile": "electrak_md_a050", "max_mm": 95.0, "current_limit_a": 5.0},
         }
         self.axes = {
-            name: ElectrakActuator(name, ActuatorSettings.model_validate(defaults[name] | changes), self.link, clock)
+            name: ElectrakActuator(name, ElectrakSettings.model_validate(defaults[name] | changes), self.link, clock)
             for name in names
         }
 
@@ -129,13 +139,34 @@ class Machine:
         self.bus.listen(lambda frame: self.frames.append((self.clock.now_s(), frame)))
         if self._open_axes:
             await asyncio.gather(*(axis.open() for axis in self.axes.values()))
+        if self._watched:
+            self._watch_task = asyncio.get_running_loop().create_task(self._watch(), name="plausibility")
         return self
 
     async def __aexit__(self, *_: object) -> None:
+        if self._watch_task is not None:
+            self._watch_task.cancel()
+            await asyncio.gather(self._watch_task, return_exceptions=True)
         for axis in self.axes.values():
             await axis.close()
         await self.link.close()
         await self.bus.close()
+
+    def conditions(self, name: str) -> set[str]:
+        """What the driver tells, and what the readings say about the motion."""
+        judged = (fault for fault in self.judged if fault.device == name)
+        return {fault.condition for fault in (*self.axes[name].faults(), *judged)}
+
+    async def _watch(self) -> None:
+        config = Config()
+        monitor = PlausibilityMonitor(motion_figures(config.rotation, config.figures()))
+        while True:
+            samples = [axis_sample(name, axis.lifecycle, axis.telemetry()) for name, axis in self.axes.items()]
+            self.judged = monitor.judge((sample for sample in samples if sample is not None), self.clock.now_s())
+            for fault in self.judged:
+                if row_for(fault, CATALOGUE).reaction is Reaction.DISARM:
+                    await self.axes[fault.device].disarm()
+            await asyncio.sleep(0.02)
 
     async def drive(self, targets: dict[str, float], seconds: float, share: float = 1.0) -> None:
         """Renew targets as the 50 Hz control tick does."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from graderd.core.soil import SoilObservation
 from graderd.hal.clock import ManualClock
-from graderd.hal.errors import CommandRangeError, DeviceError, LifecycleError
+from graderd.hal.errors import CommandRangeError, DeviceError, DeviceMissingError, LifecycleError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
@@ -14,12 +14,19 @@ from graderd.runtime.devices import Devices
 
 
 class FakeAxis:
-    """What rotator and actuator have in common. ``log`` is shared, so that the order across devices shows."""
+    """What rotator and actuator have in common; open and readable from the beginning.
+
+    ``log`` is shared, so that the order across devices shows.
+    """
+
+    LIMIT = 400.0
+    LOST = "no_reply"
 
     def __init__(self, name: str, clock: ManualClock, position: float, log: list[str]) -> None:
         self.name = name
         self.clock = clock
         self.position = position
+        self.goal: float | None = None
         self.log = log
         self.lifecycle = Lifecycle.STANDBY
         self.present: list[DeviceFault] = []
@@ -29,6 +36,21 @@ class FakeAxis:
         self.silent_since_s: float | None = None
         self.hold_raises = False
         self.held_n = 0
+        self.sent: Reading[float] | None = None
+
+    def lose(self) -> None:
+        """Its wire is cut."""
+        self.silent_since_s = self.clock.now_s()
+        if self.lifecycle is not Lifecycle.CLOSED:
+            self.lifecycle = Lifecycle.FAILED
+            self.present.append(DeviceFault(self.name, self.LOST, "its wire is cut", self.clock.now_s()))
+
+    def restore(self) -> None:
+        """Its wire is whole again."""
+        self.silent_since_s = None
+        if self.lifecycle is Lifecycle.FAILED:
+            self.lifecycle = Lifecycle.STANDBY
+            self.present.clear()
 
     def reading(self) -> Reading[float]:
         time_s = self.clock.now_s() if self.silent_since_s is None else self.silent_since_s
@@ -42,42 +64,56 @@ class FakeAxis:
             raise self.refuse_goal
         if self.lifecycle is not Lifecycle.ACTIVE:
             raise LifecycleError(self.name, "not active")
-        if not -400 < goal < 400:
+        if not -self.LIMIT <= goal <= self.LIMIT:
             raise CommandRangeError(self.name, "beyond")
+        self.sent = Reading(goal, self.clock.now_s())
         self.log.append(f"{self.name} goal {goal:.3f}")
+        self.goal = goal
         if not self.stuck:
             self.position = goal
 
     def hold(self) -> None:
         self.log.append(f"{self.name} hold")
+        self.goal = None
         self.held_n += 1
         if self.hold_raises:
             raise RuntimeError("driver bug")
 
     async def open(self) -> None:
+        self._require(Lifecycle.CLOSED)
+        if self.silent_since_s is not None:
+            raise DeviceMissingError(self.name, "its wire is cut")
         self.lifecycle = Lifecycle.STANDBY
         self.log.append(f"{self.name} open")
 
     async def arm(self) -> None:
         if self.refuse_arm is not None:
             raise self.refuse_arm
+        self._require(Lifecycle.STANDBY)
         self.lifecycle = Lifecycle.ACTIVE
         self.log.append(f"{self.name} arm")
 
     async def disarm(self) -> None:
-        self.lifecycle = Lifecycle.STANDBY
+        if self.lifecycle is Lifecycle.ACTIVE:
+            self.lifecycle = Lifecycle.STANDBY
+        self.goal = None
         self.log.append(f"{self.name} disarm")
 
     async def close(self) -> None:
         self.lifecycle = Lifecycle.CLOSED
+        self.present.clear()
         self.log.append(f"{self.name} close")
+
+    def _require(self, wanted: Lifecycle) -> None:
+        if self.lifecycle is not wanted:
+            raise LifecycleError(self.name, f"needs the state {wanted}, it is {self.lifecycle}")
 
 
 class FakeRotator(FakeAxis):
     """A rotator that is where it was told to be."""
 
     def telemetry(self) -> RotatorTelemetry:
-        return RotatorTelemetry(angle_deg=self.reading())
+        return RotatorTelemetry(angle_deg=self.reading(), goal_sent_deg=self.sent, goal_deg=self.goal)
 
     def set_goal_deg(self, goal_deg: float) -> None:
         self.go(goal_deg)
@@ -86,11 +122,14 @@ class FakeRotator(FakeAxis):
 class FakeActuator(FakeAxis):
     """An actuator that is where it was told to be."""
 
+    LOST = "no_feedback"
+
     def telemetry(self) -> ActuatorTelemetry:
-        return ActuatorTelemetry(position_mm=self.reading())
+        return ActuatorTelemetry(position_mm=self.reading(), target_sent_mm=self.sent, goal_mm=self.goal)
 
     def set_target_mm(self, target_mm: float, speed_share: float = 1.0) -> None:
-        assert 0.0 < speed_share <= 1.0
+        if not 0.0 < speed_share <= 1.0:
+            raise CommandRangeError(self.name, "no such share")
         self.go(target_mm)
 
 

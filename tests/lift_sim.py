@@ -18,7 +18,6 @@ from graderd.core import commands as cmd
 from graderd.core.axes import LIFTS
 from graderd.core.machine import Mode
 from graderd.core.tick import Tick
-from graderd.drivers.j1939.link import ACM_PERIOD_S
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
 from graderd.runtime.state_file import StateFile
@@ -26,6 +25,8 @@ from graderd.simulator.actuators import VirtualElectrak
 from tests.electrak_sim import Machine, SimulatedLoop
 from tests.fakes import FakeActuator, FakeEyes, FakeRotator
 
+CONTROL_PERIOD_S: Final = 0.1
+"""Of the control messages on the bus."""
 RENEW_S: Final = 0.1
 LOOK_S: Final = 0.01
 KNOWN_AFTER_MM: Final = 25.0
@@ -136,9 +137,8 @@ class LiftMachine:
 async def lift_machine(clock: SimulatedLoop, seed: int = 0, config: Config | None = None) -> AsyncIterator[LiftMachine]:
     """Armed and at rest."""
     config = config or Config()
-    async with Machine(
-        clock, names=(*LIFTS, "spare"), seed=seed, speed_percent=config.lift_left.speed_percent
-    ) as machine:
+    speed_percent = config.lift_left.model_dump()["speed_percent"]
+    async with Machine(clock, names=(*LIFTS, "spare"), seed=seed, speed_percent=speed_percent) as machine:
         lifts = LiftMachine(clock, machine, config)
         running = asyncio.create_task(lifts.loop.run(), name="control")
         try:
@@ -160,7 +160,7 @@ class SlowSide:
         """Seconds from one place to the other; begins some control periods later, at the same point of one."""
         await self._axis.disarm()
         self.unit.position_mm = from_mm
-        await asyncio.sleep(5 * ACM_PERIOD_S)
+        await asyncio.sleep(5 * CONTROL_PERIOD_S)
         await self._axis.arm()
         start_s = self._clock.now_s()
         while True:

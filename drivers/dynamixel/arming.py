@@ -8,7 +8,7 @@ import math
 from graderd.drivers.dynamixel.calibration import Calibration
 from graderd.drivers.dynamixel.device import WATCHDOG_STEP_S, WATCHDOG_TRIPPED, Ph54Device
 from graderd.hal.errors import DeviceError, DeviceRefusedError
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 
 HOLD_ACCELERATION_FACTOR = 10.0
 """A hold brakes so much harder than a move: at 30 °/s and 60 °/s² the blade overruns by 0.75° and comes back."""
@@ -16,12 +16,12 @@ _JUMP_DEG = 0.5
 _STILL_DEG_PER_S = 2.0
 
 
-def watchdog_counts(settings: RotatorSettings) -> int:
+def watchdog_counts(settings: Ph54Settings) -> int:
     """Bus Watchdog register for the settings' time: one step less than fits in, so that the blade stands by then."""
     return max(1, min(127, math.floor(settings.watchdog_s / WATCHDOG_STEP_S + 1e-9) - 1))
 
 
-def profile_counts(settings: RotatorSettings, calibration: Calibration, factor: float = 1.0) -> dict[str, int]:
+def profile_counts(settings: Ph54Settings, calibration: Calibration, factor: float = 1.0) -> dict[str, int]:
     """Profile registers of a move, its acceleration times ``factor``."""
     return {
         "profile_acceleration": calibration.acceleration_counts(settings.profile_acceleration_deg_per_s2 * factor),
@@ -29,7 +29,7 @@ def profile_counts(settings: RotatorSettings, calibration: Calibration, factor: 
     }
 
 
-async def power_up(device: Ph54Device, settings: RotatorSettings, calibration: Calibration) -> int:
+async def power_up(device: Ph54Device, settings: Ph54Settings, calibration: Calibration) -> int:
     """Write and read back limits, profile and watchdog, set goal := measured, torque on. Returns the goal in counts.
 
     Position limits and current limit are EEPROM: written only where they differ (cells wear, and torque must be off
@@ -48,7 +48,7 @@ async def power_up(device: Ph54Device, settings: RotatorSettings, calibration: C
         raise
 
 
-async def _power_up(device: Ph54Device, settings: RotatorSettings, calibration: Calibration) -> int:
+async def _power_up(device: Ph54Device, settings: Ph54Settings, calibration: Calibration) -> int:
     health, alert = await device.read_block(device.health_block)
     if alert or health["hardware_error_status"]:
         raise DeviceRefusedError(

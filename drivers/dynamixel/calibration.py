@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 from graderd.drivers.dynamixel.table import ControlTable
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 
 _LIMIT_MARGIN_DEG = 1.0
 """The servo's own position limits lie so far outside the soft limits, so that ours act first."""
@@ -31,7 +31,7 @@ class Calibration:
     torque_nm_per_a: float
 
     @classmethod
-    def of(cls, settings: RotatorSettings, table: ControlTable) -> Calibration:
+    def of(cls, settings: Ph54Settings, table: ControlTable) -> Calibration:
         """From the settings and the model's profile."""
         motion, rating = table.profile["motion"], table.profile["rating"]
         per_s = motion["velocity_rev_per_min_per_count"] * _DEG_PER_S_PER_REV_PER_MIN

@@ -18,11 +18,13 @@ from graderd.hal.errors import (
     DeviceTimeoutError,
     WrongDeviceError,
 )
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.fault import DeviceFault
+from graderd.hal.settings import Ph54Settings
 
 _REBOOT_S = 5.0
 _LOOK_EVERY_S = 0.05
 _MANY = 1_000_000
+_LATENCY_WANTED_MS = 1
 
 
 class ServoLink:
@@ -30,7 +32,7 @@ class ServoLink:
 
     def __init__(
         self,
-        settings: RotatorSettings,
+        settings: Ph54Settings,
         table: ControlTable,
         expected_mode: int,
         clock: Clock,
@@ -40,6 +42,8 @@ class ServoLink:
         self.firmware_version: int | None = None
         self.happened: Counter[str] = Counter()
         self.bus: ServoBus | None = None
+        self.slow_adapter: DeviceFault | None = None
+        """The present adapter holds bytes back, which makes every reply late, whatever the baud rate."""
         self._settings = settings
         self._table = table
         self._mode = expected_mode
@@ -79,14 +83,24 @@ class ServoLink:
         port = find_port(s.port, s.usb_serial_number, self._list_ports)
         self.bus = ServoBus(port, s.baud_n, clock=self._clock, bus_log=self._bus_log)
         self.bus.open()
+        self.slow_adapter = self._judge_adapter(self.bus)
         device = Ph54Device(self.bus, self._table, s.servo_id_n)
         self.firmware_version = await device.identify(self._mode)
         self._device = device
         return device
 
+    def _judge_adapter(self, bus: ServoBus) -> DeviceFault | None:
+        """Adapters without a latency timer, and ptys, hold nothing back."""
+        timer_ms = bus.latency_timer_ms
+        if timer_ms is None or timer_ms <= _LATENCY_WANTED_MS:
+            return None
+        detail = f"{bus.port}: latency timer {timer_ms} ms, {_LATENCY_WANTED_MS} ms is wanted"
+        return DeviceFault("servo_bus", "adapter_latency", detail, self._clock.now_s())
+
     def disconnect(self) -> None:
         """Let go of the port and remember what was counted. Idempotent."""
         self._device = None
+        self.slow_adapter = None
         if self.bus is not None:
             bus, self.bus = self.bus, None
             bus.close()

@@ -8,18 +8,17 @@ from dataclasses import replace
 from graderd.drivers.dynamixel.bus import ServoBus
 from graderd.drivers.dynamixel.calibration import Calibration
 from graderd.drivers.dynamixel.device import WATCHDOG_TRIPPED, Ph54Device
-from graderd.drivers.dynamixel.faultbook import FaultBook
-from graderd.drivers.dynamixel.motion_faults import MotionDetectors, Sample
 from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.clock import Clock
+from graderd.hal.fault import PresentFaults
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 
 _CORRUPT_N, _CORRUPT_WINDOW_S = 3, 1.0
-MOTION_FAULTS = frozenset(
-    {"not_moving", "wrong_way", "moving_uncommanded", "voltage_near_limit", "temperature_near_limit"}
-)
+_VOLTAGE_HYSTERESIS_V = 0.3
+_TEMPERATURE_HYSTERESIS_C = 2.0
+SUPPLY_FAULTS = ("voltage_near_limit", "temperature_near_limit")
 
 
 class ServoObserver:
@@ -31,27 +30,26 @@ class ServoObserver:
     """
 
     def __init__(
-        self, device_name: str, settings: RotatorSettings, table: ControlTable, calibration: Calibration, clock: Clock
+        self, device_name: str, settings: Ph54Settings, table: ControlTable, calibration: Calibration, clock: Clock
     ) -> None:
         self.telemetry = RotatorTelemetry()
-        self.faults = FaultBook(device_name)
+        self.faults = PresentFaults(device_name)
         self.torque_on = False
         self.tripped = False
         self.turns_unknown = False
         self.turns_jumped = False
         self.health_s = self.goals_s = float("-inf")
+        self._settings = settings
         self._calibration = calibration
         self._clock = clock
         self._alerts = {int(bit, 16): name for bit, name in table.profile["hardware_error"].items()}
         self._alert_names = frozenset(self._alerts.values())
-        self._detectors = MotionDetectors(settings)
         self._counts: int | None = None
         self._damaged_n = 0
         self._damaged_s: deque[float] = deque(maxlen=64)
 
     def restart(self, *, position_known: bool = False) -> None:
-        """A servo just found or armed: motion is watched anew. ``position_known``: a jump from the last one counts."""
-        self._detectors.restart()
+        """A servo just found or armed. ``position_known``: a jump from the last one counts."""
         self.turns_jumped = False
         if not position_known:
             self._counts = None
@@ -59,7 +57,7 @@ class ServoObserver:
     # -- readings ---------------------------------------------------------------------------------------------
 
     async def read_telemetry(self, device: Ph54Device, goal_deg: float | None, *, attempts_n: int = 1) -> None:
-        """One telemetry block; ``goal_deg`` is what the servo was last told while it is powered by us."""
+        """One telemetry block; ``goal_deg`` is where the servo is driving the blade to, if anywhere."""
         values, alert = await device.read_block(device.telemetry_block, attempts_n=attempts_n)
         now_s, cal = self._clock.now_s(), self._calibration
         angle_deg = cal.blade_deg(self._follow_turns(values["present_position"], now_s))
@@ -76,10 +74,10 @@ class ServoObserver:
             temperature_c=Reading(celsius, now_s),
             moving=Reading(bool(values["moving"]), now_s),
             in_position=Reading(bool(values["moving_status"] & 1), now_s),
+            goal_deg=goal_deg,
         )
-        sample = Sample(now_s, angle_deg, velocity, current_ma / 1000.0, volts, celsius, goal_deg)
-        self.faults.replace(MOTION_FAULTS, self._detectors.look(sample), now_s)
-        if alert and not any(name in self.faults for name in self._alert_names):
+        self._watch_supply(volts, celsius, now_s)
+        if alert and not self.faults.names(now_s) & self._alert_names:
             self.health_s = float("-inf")  # read it next
 
     def _follow_turns(self, counts: int, now_s: float) -> int:
@@ -93,7 +91,7 @@ class ServoObserver:
                 self.turns_unknown = True
                 self.faults.set("turns_lost", f"{detail}: confirm the blade's angle", now_s)
             else:
-                self.faults.event("turns_lost", f"{detail}; the angle within one turn is known", now_s)
+                self.faults.tell("turns_lost", f"{detail}; the angle within one turn is known", now_s)
         return counts if extended else (counts + turn // 2) % turn - turn // 2
 
     async def read_health(self, device: Ph54Device, *, attempts_n: int = 1) -> None:
@@ -106,7 +104,7 @@ class ServoObserver:
             for bit, name in self._alerts.items()
             if bits & bit
         }
-        self.faults.replace(self._alert_names, present, now_s)
+        self.faults.keep_only(present, now_s, among=self._alert_names)
         self.set_torque(bool(health["torque_enable"]))
 
     async def read_goals(self, device: Ph54Device, *, attempts_n: int = 1) -> dict[str, int]:
@@ -115,7 +113,7 @@ class ServoObserver:
         goals, _ = await device.read_block(device.goal_block, attempts_n=attempts_n)
         tripped = goals["bus_watchdog"] == WATCHDOG_TRIPPED
         if tripped and not self.tripped:
-            self.faults.event("watchdog_tripped", "the servo's bus watchdog has stopped it; arm again", now_s)
+            self.faults.tell("watchdog_tripped", "the servo's bus watchdog has stopped it; arm again", now_s)
         self.tripped = tripped
         return goals
 
@@ -129,17 +127,28 @@ class ServoObserver:
         sent = Reading(self._calibration.blade_deg(counts), self._clock.now_s())
         self.telemetry = replace(self.telemetry, goal_sent_deg=sent)
 
+    def _watch_supply(self, volts: float, celsius: float, now_s: float) -> None:
+        """Warn ahead of the servo's own limits; a hysteresis keeps a value at the edge from flickering."""
+        st, warned = self._settings, self.faults.names(now_s)
+        slack_v = _VOLTAGE_HYSTERESIS_V if "voltage_near_limit" in warned else 0.0
+        inside = st.voltage_warn_low_v + slack_v <= volts <= st.voltage_warn_high_v - slack_v
+        detail = f"{volts:.1f} V, warning outside {st.voltage_warn_low_v:g}…{st.voltage_warn_high_v:g} V"
+        self.faults.keep("voltage_near_limit", not inside, detail, now_s)
+        slack_c = _TEMPERATURE_HYSTERESIS_C if "temperature_near_limit" in warned else 0.0
+        detail = f"{celsius:.0f} °C, warning from {st.temperature_warn_c:g} °C"
+        self.faults.keep("temperature_near_limit", celsius >= st.temperature_warn_c - slack_c, detail, now_s)
+
     # -- judgement --------------------------------------------------------------------------------------------
 
     def name_torque_loss(self, goals: dict[str, int]) -> None:
         """Torque that was ours is off: say why, as far as the registers tell."""
         now_s = self._clock.now_s()
-        if any(name in self.faults for name in self._alert_names):
+        if self.faults.names(now_s) & self._alert_names:
             return
         if goals["bus_watchdog"] == 0:
-            self.faults.event("ram_reset", "the servo's RAM registers were reset: its power was cut", now_s)
+            self.faults.tell("ram_reset", "the servo's RAM registers were reset: its power was cut", now_s)
         else:
-            self.faults.event("torque_off", "torque was found switched off", now_s)
+            self.faults.tell("torque_off", "torque was found switched off", now_s)
 
     def count_damage(self, bus: ServoBus) -> None:
         """Several damaged replies within a second are a fault even where others get through."""
@@ -147,10 +156,8 @@ class ServoObserver:
         self._damaged_s.extend([now_s] * min(max(0, damaged_n - self._damaged_n), 8))
         self._damaged_n = damaged_n
         recent_n = sum(1 for at_s in self._damaged_s if now_s - at_s <= _CORRUPT_WINDOW_S)
-        if recent_n >= _CORRUPT_N:
-            self.faults.set("corrupt_replies", f"{recent_n} damaged replies within {_CORRUPT_WINDOW_S:g} s", now_s)
-        else:
-            self.faults.clear("corrupt_replies")
+        detail = f"{recent_n} damaged replies within {_CORRUPT_WINDOW_S:g} s"
+        self.faults.keep("corrupt_replies", recent_n >= _CORRUPT_N, detail, now_s)
 
     def damaged_lately(self) -> bool:
         """Whether a lost connection was damaged replies rather than silence."""

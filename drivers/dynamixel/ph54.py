@@ -19,7 +19,7 @@ from graderd.drivers.dynamixel.connection import ServoLink, condition_of
 from graderd.drivers.dynamixel.device import EXTENDED_MODE, POSITION_MODE, Difference
 from graderd.drivers.dynamixel.observer import ServoObserver
 from graderd.drivers.dynamixel.serial_port import ListPorts, system_ports
-from graderd.drivers.dynamixel.servo_task import DEVICE, LINK_FAULTS, CommandSlot, ServoTask
+from graderd.drivers.dynamixel.servo_task import DEVICE, FIELDS, LINK_FAULTS, CommandSlot, ServoTask
 from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import (
@@ -31,7 +31,7 @@ from graderd.hal.errors import (
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.rotator import RotatorTelemetry
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ class Ph54Rotator:
 
     def __init__(
         self,
-        settings: RotatorSettings,
+        settings: Ph54Settings,
         clock: Clock | None = None,
         bus_log: BusLog | None = None,
         *,
@@ -89,7 +89,8 @@ class Ph54Rotator:
 
     def faults(self) -> tuple[DeviceFault, ...]:
         """Conditions present now. Events (trips, lost turns) stay visible for a second after they happened."""
-        return self._observer.faults.present(self._clock.now_s())
+        present, slow = self._observer.faults.present(self._clock.now_s()), self._link.slow_adapter
+        return present if slow is None else (*present, slow)
 
     async def wait_telemetry(self) -> RotatorTelemetry:
         """The next telemetry, as soon as it was read (or the connection's state changed)."""
@@ -171,7 +172,7 @@ class Ph54Rotator:
                 async with asyncio.timeout(_CLOSE_S):
                     await self._keeper.power_down(off=self.settings.torque_at_exit == "off", leaving=True)
             except (DeviceError, TimeoutError) as e:
-                log.error("%s: could not be made safe at exit (%s); its bus watchdog stops it", DEVICE, e)
+                log.error("%s: could not be made safe at exit (%s); its bus watchdog stops it", DEVICE, e, extra=FIELDS)
         await self._keeper.stop()
 
     async def reboot(self) -> None:

@@ -14,13 +14,13 @@ from graderd.drivers.dynamixel.codec import Instruction, Packet, StreamDecoder, 
 from graderd.drivers.dynamixel.serial_port import ListPorts, find_port, open_port, system_ports
 from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.errors import DeviceTimeoutError
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 
 _REPLY_S = 0.1
 _ATTEMPTS_N = 3
 
 
-def safe_off(settings: RotatorSettings, *, list_ports: ListPorts = system_ports) -> str:
+def safe_off(settings: Ph54Settings, *, list_ports: ListPorts = system_ports) -> str:
     """Bring the blade servo into the state ``torque_at_exit`` asks for, and leave. Blocks for a second at most.
 
     ``off``: torque off. ``on``: goal := measured with torque left as it is, bus watchdog off duty, so that the servo

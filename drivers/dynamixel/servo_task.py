@@ -14,11 +14,11 @@ from graderd.drivers.dynamixel.calibration import Calibration
 from graderd.drivers.dynamixel.codec import StatusError
 from graderd.drivers.dynamixel.connection import ServoLink, condition_of
 from graderd.drivers.dynamixel.device import ATTEMPTS_N, Ph54Device
-from graderd.drivers.dynamixel.observer import MOTION_FAULTS, ServoObserver
+from graderd.drivers.dynamixel.observer import SUPPLY_FAULTS, ServoObserver
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceError, DeviceLostError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 
 
 class CommandSlot:
@@ -27,7 +27,7 @@ class CommandSlot:
     ``goal_deg``: the goal in force, None while holding. ``hold_wanted``: a hold that has not gone out yet.
     """
 
-    def __init__(self, settings: RotatorSettings, calibration: Calibration) -> None:
+    def __init__(self, settings: Ph54Settings, calibration: Calibration) -> None:
         self.goal_deg: float | None = None
         self.hold_wanted = False
         self._goal_s = -math.inf
@@ -50,6 +50,11 @@ class CommandSlot:
         """No command in force; ``sent_counts``: the goal that arming has left on the servo."""
         self.goal_deg, self.hold_wanted, self._braking = None, False, False
         self._sent_counts = sent_counts
+
+    @property
+    def holding(self) -> bool:
+        """Whether the last thing sent was a hold."""
+        return self._braking
 
     def expired(self, now_s: float) -> bool:
         """Whether the goal was not renewed in time."""
@@ -84,6 +89,7 @@ class CommandSlot:
 log = logging.getLogger(__name__)
 
 DEVICE = "rotation"
+FIELDS = {"device": DEVICE}
 LINK_FAULTS = ("no_reply", "corrupt_replies", "unplugged", "wrong_device")
 """Conditions that end when the servo is found again."""
 _HEALTH_EVERY_S = 0.1
@@ -109,7 +115,7 @@ class ServoTask:
     """
 
     def __init__(
-        self, settings: RotatorSettings, link: ServoLink, observer: ServoObserver, command: CommandSlot, clock: Clock
+        self, settings: Ph54Settings, link: ServoLink, observer: ServoObserver, command: CommandSlot, clock: Clock
     ) -> None:
         self.lifecycle = Lifecycle.CLOSED
         self.torque_is_ours = False
@@ -213,7 +219,7 @@ class ServoTask:
                 if began is None and not self._command.hold_wanted:
                     began = angle
                 if off and began is not None and angle is not None and abs(angle.value - began.value) > _RUNAWAY_DEG:
-                    log.warning("%s: does not obey the hold: torque off without waiting for rest", DEVICE)
+                    log.warning("%s: does not obey the hold: torque off without waiting for rest", DEVICE, extra=FIELDS)
                     break
             if off:
                 await self._torque_off(device)
@@ -227,7 +233,7 @@ class ServoTask:
         """The owner of the wire must not die while the rotator is open: start it again."""
         if task is self._task and self.lifecycle is not Lifecycle.CLOSED:
             cause = "was cancelled" if task.cancelled() else f"failed: {task.exception()!r}"
-            log.error("%s: the servo task %s; starting it again", DEVICE, cause)
+            log.error("%s: the servo task %s; starting it again", DEVICE, cause, extra=FIELDS)
             self._fail(DeviceLostError(DEVICE, f"the servo task {cause}"))
             self.start()
 
@@ -241,13 +247,14 @@ class ServoTask:
                         await self.connect()
                         self.lifecycle = Lifecycle.STANDBY
                     self._link.happened["reconnects_n"] += 1
-                    log.info("%s: servo found at %s", DEVICE, self._link.bus.port if self._link.bus else "?")
+                    port = self._link.bus.port if self._link.bus else "?"
+                    log.info("%s: servo found at %s", DEVICE, port, extra=FIELDS)
                 pause_s = _RECONNECT_FIRST_S
                 await self._serve()
             except DeviceError as e:
                 self._fail(e)
             except Exception as e:  # a bug in here must not end the search for the servo
-                log.exception("%s: unexpected error in the servo task", DEVICE)
+                log.exception("%s: unexpected error in the servo task", DEVICE, extra=FIELDS)
                 self._fail(DeviceLostError(DEVICE, f"internal error {e!r}"))
             await asyncio.sleep(pause_s)
             pause_s = min(_RECONNECT_MOST_S, 2 * pause_s)
@@ -256,9 +263,10 @@ class ServoTask:
         condition, faults = condition_of(error), self._observer.faults
         if condition == "no_reply" and self._observer.damaged_lately():
             condition = "corrupt_replies"
-        if faults.set(condition, error.cause, self._clock.now_s()):
-            log.warning("%s: %s", condition, error)
-        faults.clear(*(c for c in LINK_FAULTS if c != condition), *MOTION_FAULTS)
+        faults.set(condition, error.cause, self._clock.now_s())
+        # At every attempt: the log repeats it ever more rarely.
+        log.warning("%s: %s", condition, error, extra={**FIELDS, "fault": f"{DEVICE}.{condition}"})
+        faults.clear(*(c for c in LINK_FAULTS if c != condition), *SUPPLY_FAULTS)
         self.lifecycle = Lifecycle.FAILED
         self._command.forget()
         self._link.disconnect()
@@ -316,9 +324,10 @@ class ServoTask:
             observer.count_damage(self._link.bus)
 
     def _standing_goal_deg(self) -> float | None:
-        """What the servo was last told to do; None while nothing is powered by us."""
+        """Where the servo drives the blade to; None while it is not powered by us, or was told to hold."""
         sent = self._observer.telemetry.goal_sent_deg
-        return sent.value if self.lifecycle is Lifecycle.ACTIVE and sent is not None else None
+        drives = self.lifecycle is Lifecycle.ACTIVE and not self._command.holding
+        return sent.value if drives and sent is not None else None
 
     async def _check_goals(self, device: Ph54Device) -> None:
         """Whether the watchdog still stands as it was written."""
@@ -349,7 +358,7 @@ class ServoTask:
     async def _end_active(self, device: Ph54Device, condition: str = "", detail: str = "") -> None:
         self.lifecycle = Lifecycle.STANDBY
         if condition:
-            self._observer.faults.event(condition, detail, self._clock.now_s())
+            self._observer.faults.tell(condition, detail, self._clock.now_s())
         await self._make_safe(device)
 
     async def _tolerant(self, step: Coroutine[None, None, None]) -> None:
@@ -386,7 +395,7 @@ class ServoTask:
 
     async def _on_refusal(self, device: Ph54Device, error: ServoRefusedError) -> None:
         """A goal was refused: the watchdog has tripped, or the servo is not as we left it. Never go on blindly."""
-        log.warning("%s: %s", DEVICE, error)
+        log.warning("%s: %s", DEVICE, error, extra=FIELDS)
         was_active = self.lifecycle is Lifecycle.ACTIVE
         if was_active:
             self.lifecycle = Lifecycle.STANDBY
@@ -394,5 +403,5 @@ class ServoTask:
             await self._observer.read_goals(device, attempts_n=ATTEMPTS_N)
         elif was_active:
             detail = f"a goal was refused: {error.cause}"
-            self._observer.faults.event("ram_reset", detail, self._clock.now_s())
+            self._observer.faults.tell("ram_reset", detail, self._clock.now_s())
         await self._make_safe(device)

@@ -26,7 +26,7 @@ class StepSample:
     goal_deg: float
     angle_deg: float
     velocity_deg_per_s: float
-    current_a: float
+    current_a: float | None
     reference_deg: float | None = None
 
 
@@ -46,7 +46,7 @@ class StepMetrics:
     overshoot_deg: float
     settling_s: float | None
     error_deg: float
-    peak_current_a: float
+    peak_current_a: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +173,7 @@ def _measure(before: Sequence[StepSample], part: Sequence[StepSample], tolerance
         overshoot_deg=max(0.0, beyond * abs(way_deg)),
         settling_s=(outside[-1] - start_s if outside else 0.0) if settled else None,
         error_deg=_mean([s.angle_deg for s in _tail(part)]) - goal_deg,
-        peak_current_a=max(abs(s.current_a) for s in part),
+        peak_current_a=max((abs(s.current_a) for s in part if s.current_a is not None), default=None),
     )
 
 
@@ -243,7 +243,8 @@ def render(recording: StepRecording, *, title: str = "Step response of the blade
         "angle, degrees",
         [_Curve("goal", lambda s: s.goal_deg, jumps=True), _Curve("measured", lambda s: s.angle_deg)],
     )
-    current = _plot(samples, "motor current, ampere", [_Curve("current", lambda s: s.current_a)])
+    told = [s for s in samples if s.current_a is not None]
+    current = _plot(told, "motor current, ampere", [_Curve("current", lambda s: s.current_a or 0.0)]) if told else ""
     rows = "".join(_row(step) for step in recording.steps)
     used = "".join(f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in recording.settings.items())
     source = {
@@ -270,7 +271,7 @@ def _row(step: StepMetrics) -> str:
         f"{step.overshoot_deg:.2f}°",
         _seconds(step.settling_s),
         f"{_number(step.error_deg, 3)}°",
-        f"{step.peak_current_a:.2f} A",
+        "not told" if step.peak_current_a is None else f"{step.peak_current_a:.2f} A",
     )
     return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 

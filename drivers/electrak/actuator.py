@@ -6,21 +6,20 @@ import asyncio
 import math
 from typing import Final
 
-from graderd.drivers.electrak.codec import Control, ElectrakCodec
-from graderd.drivers.electrak.motion_faults import (
-    DISARMING,
+from graderd.drivers.electrak.codec import SELECTABLE_ADDRESSES, Control, ElectrakCodec
+from graderd.drivers.electrak.feedback import (
     FAILING,
     INFORMATIVE,
-    LATCHING,
     RECOVERY_N,
+    TRIPPING,
     TRUST_N,
-    FaultMemory,
     FeedbackMonitor,
     FeedbackTrack,
 )
 from graderd.drivers.electrak.planner import MotionPlanner
 from graderd.drivers.electrak.profile import load_profile
 from graderd.drivers.electrak.thermal import OverloadPolicy, ThermalGuard, Verdict
+from graderd.drivers.j1939.ids import Frame, Pgn, make_id
 from graderd.drivers.j1939.link import CanLink
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import (
@@ -30,17 +29,18 @@ from graderd.hal.errors import (
     DeviceTimeoutError,
     LifecycleError,
 )
-from graderd.hal.fault import DeviceFault
+from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
-from graderd.hal.settings import ActuatorSettings
+from graderd.hal.settings import ElectrakSettings
 
 WAKE_TIMEOUT_S: Final = 3.0
 _SILENCE_S: Final = 1.0
 _WAKING_S: Final = 0.5
 """A claim so soon after our first message of a while is that of a unit which fell asleep meanwhile."""
 _CLOSE_REPEATS_N: Final = 3
+_CONTROL_PRIORITY: Final = 6
 
 
 class ElectrakActuator:
@@ -51,11 +51,10 @@ class ElectrakActuator:
     * the control message goes out every 100 ms in every state but closed, with motion disabled unless a fresh target
       exists, which keeps the actuator awake and its feedback coming;
     * after an overload, motion stays disabled until the actuator's flag is gone, then the settings' number of retries
-      follows, one a second; when they are used up the fault latches and the axis is in standby;
-    * a latched fault (see ``monitor.LATCHING``) goes with the next successful :meth:`arm`.
+      follows, one a second; when they are used up the overload is told and the axis is in standby.
     """
 
-    def __init__(self, name: str, settings: ActuatorSettings, link: CanLink, clock: Clock | None = None) -> None:
+    def __init__(self, name: str, settings: ElectrakSettings, link: CanLink, clock: Clock | None = None) -> None:
         self.name = name
         self.settings = settings
         self.profile = load_profile(settings.profile).with_figures(settings.figures)
@@ -67,7 +66,7 @@ class ElectrakActuator:
         self._planner = MotionPlanner(
             figures, current_limit_a=settings.current_limit_a, speed_percent=settings.speed_percent
         )
-        self._faults = FaultMemory(name)
+        self._faults = PresentFaults(name)
         self._monitor = FeedbackMonitor(figures, settings.address_n, self._faults)
         self._thermal = ThermalGuard(figures)
         self._lifecycle = Lifecycle.CLOSED
@@ -79,7 +78,9 @@ class ElectrakActuator:
         self._resumed_at_s = -math.inf
         self._sent: Reading[float] | None = None
         self._sent_enabled = False
+        self._may_move = False
         self._overload = OverloadPolicy(settings.overload_retries_n)
+        self._overload_detail = ""
         self._claimed_name: int | None = None
         self._counters = {"feedback_n": 0, "control_n": 0, "restarts_n": 0, "target_timeouts_n": 0}
 
@@ -89,6 +90,11 @@ class ElectrakActuator:
     def address(self) -> int:
         """J1939 address of the actuator."""
         return self.settings.address_n
+
+    @property
+    def feedback_pgn(self) -> int:
+        """Group of the actuator feedback message."""
+        return Pgn.PROPRIETARY_A2
 
     @property
     def lifecycle(self) -> Lifecycle:
@@ -113,6 +119,7 @@ class ElectrakActuator:
             return ActuatorTelemetry(thermal_load=self._thermal.load, target_sent_mm=self._sent, counters=counters)
         return ActuatorTelemetry(
             position_mm=Reading(feedback.position_mm, at_s),
+            goal_mm=self._planner.target_mm if self._sent_enabled else None,
             velocity_mm_per_s=Reading(self._track.velocity_mm_per_s, at_s),
             current_a=Reading(feedback.current_a, at_s),
             duty_percent=Reading(feedback.duty_percent, at_s),
@@ -124,10 +131,10 @@ class ElectrakActuator:
         )
 
     def faults(self) -> tuple[DeviceFault, ...]:
-        """Conditions present now; those that latch stay until the next arm, marked as latched once they are over."""
+        """Conditions present now. Events (a restart, an overload) stay visible for a second after they happened."""
         now_s = self._clock.now_s()
         self._watch(now_s)
-        return self._faults.all(now_s, self._track.flags)
+        return self._faults.present(now_s)
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -143,7 +150,7 @@ class ElectrakActuator:
             raise LifecycleError(self.name, f"cannot open while {self._lifecycle}", "Close it first")
         await self._link.open()
         now_s = self._clock.now_s()
-        self._forget(now_s)
+        self._forget()
         self._opened_at_s = now_s
         self._link.attach(self)
         try:
@@ -151,7 +158,7 @@ class ElectrakActuator:
                 await self._heard.wait()
         except TimeoutError:
             self._link.detach(self)
-            self._faults.clear(*self._faults.names())
+            self._faults.clear_all()
             raise self._no_feedback_error() from None
         except BaseException:
             self._link.detach(self)
@@ -175,13 +182,13 @@ class ElectrakActuator:
         if self._track.age_s(now_s) > self.settings.feedback_timeout_s:
             raise DeviceTimeoutError(self.name, f"feedback is {self._track.age_s(now_s):.2f} s old")
         standing = [flag for flag in ("overload", "fatal") if flag in self._track.flags]
-        self._faults.clear(*(LATCHING - set(standing)))
-        left = self._faults.names() - INFORMATIVE
+        self._faults.clear(*(TRIPPING - set(standing)))
+        left = self._faults.names(now_s) - INFORMATIVE
         if left:
-            details = "; ".join(f.detail for f in self._faults.all(now_s) if f.condition in left)
+            details = "; ".join(f.detail for f in self._faults.present(now_s) if f.condition in left)
             raise DeviceRefusedError(self.name, f"cannot arm with {', '.join(sorted(left))}: {details}")
         self._planner.hold()
-        self._monitor.reset(now_s)
+        self._monitor.reset()
         self._overload.rearm()
         self._lifecycle = Lifecycle.ACTIVE
 
@@ -203,7 +210,7 @@ class ElectrakActuator:
             self._link.send_control(self)
         self._link.detach(self)
         self._lifecycle = Lifecycle.CLOSED
-        self._faults.clear(*self._faults.names())
+        self._faults.clear_all()
 
     # -- commands ---------------------------------------------------------------------------------------------------
 
@@ -234,19 +241,20 @@ class ElectrakActuator:
 
     # -- the link's side --------------------------------------------------------------------------------------------
 
-    def control_data(self, now_s: float) -> bytes:
+    def control_frame(self, source: int, now_s: float) -> Frame:
         """The control message that goes out now."""
         if now_s - self._control_at_s > _SILENCE_S:
             self._resumed_at_s = now_s
         self._control_at_s = now_s
         self._watch(now_s)
-        control = self._next_control(now_s)
-        self._sent_enabled = control.motion_enable
-        if control.motion_enable:
-            self._sent = Reading(control.target_mm, now_s)
-        self._counters["control_n"] += 1
-        self._monitor.on_sent(control.motion_enable, self._planner.direction, now_s)
-        return self._codec.encode_control(control)
+        return self._control_message(self._next_control(now_s), source, now_s)
+
+    def stop_frame(self, source: int, now_s: float) -> Frame | None:
+        """Motion disabled; None where the actuator was told so and is seen at rest since."""
+        if not self._may_move:
+            return None
+        here_mm = self._track.feedback.position_mm if self._track.feedback else 0.0
+        return self._control_message(self._planner.disabled(here_mm), source, now_s)
 
     def on_feedback(self, data: bytes, now_s: float) -> None:
         """A feedback message from this address."""
@@ -259,10 +267,8 @@ class ElectrakActuator:
             return
         if self._track.age_s(now_s) > self.settings.feedback_timeout_s:
             self._track.begin_anew()
-            self._monitor.reset(now_s)
-        sent = self._sent
-        remaining_mm = abs(sent.value - feedback.position_mm) if sent and self._sent_enabled else 0.0
-        if not self._monitor.on_feedback(feedback, self._planner.direction, remaining_mm, now_s):
+            self._monitor.reset()
+        if not self._monitor.on_feedback(feedback, now_s):
             self._track.good_n = 0
             self._watch(now_s)
             return
@@ -270,6 +276,7 @@ class ElectrakActuator:
         self._track.take(feedback, now_s)
         self._thermal.update(feedback.current_a, now_s)
         self._planner.on_feedback(self._track.motion(now_s))
+        self._may_move = feedback.moving or self._sent_enabled
         if self._link.address is None:
             # Still awake from before, and about to sleep: what is heard while we may not speak is no answer to us.
             self._track.good_n = 0
@@ -291,7 +298,7 @@ class ElectrakActuator:
             return
         self._counters["restarts_n"] += 1
         what = "another unit claimed its address" if moved_in else "it claimed its address anew: a power cut?"
-        self._faults.set("restarted", what, now_s)
+        self._faults.tell("restarted", what, now_s)
         self._watch(now_s)
 
     def on_link_lost(self, now_s: float) -> None:
@@ -302,6 +309,14 @@ class ElectrakActuator:
         self._fail()
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _control_message(self, control: Control, source: int, now_s: float) -> Frame:
+        self._sent_enabled = control.motion_enable
+        if control.motion_enable:
+            self._sent, self._may_move = Reading(control.target_mm, now_s), True
+        self._counters["control_n"] += 1
+        can_id = make_id(_CONTROL_PRIORITY, Pgn.PROPRIETARY_A, source, self.address)
+        return Frame(can_id, self._codec.encode_control(control))
 
     def _next_control(self, now_s: float) -> Control:
         feedback = self._track.feedback
@@ -321,7 +336,11 @@ class ElectrakActuator:
         elif verdict is Verdict.LATCH:
             tried_n = self.settings.overload_retries_n
             detail = f"more than {self.settings.current_limit_a:.1f} A for 50 ms"
-            self._faults.set("overload", detail + (f", {tried_n} retries used up" if tried_n else ""), now_s)
+            detail += f", {tried_n} retries used up" if tried_n else ""
+            self._overload_detail = detail
+            self._faults.tell("overload", detail, now_s)
+        elif tripped and "overload" in self._faults.names(now_s):
+            self._faults.tell("overload", self._overload_detail, now_s)  # present as long as the flag is
 
     def _watch(self, now_s: float) -> None:
         """Draw the consequences: lost feedback fails the axis, disarming faults take it out of the active state."""
@@ -330,19 +349,19 @@ class ElectrakActuator:
         age_s = now_s - max(self._track.feedback_at_s, self._opened_at_s)
         if age_s > self.settings.feedback_timeout_s:
             self._track.good_n = 0
-            unknown = [a for a in self._link.unknown_feedback_addresses(now_s) if 19 <= a <= 42]
+            unknown = self._strangers(now_s)
             detail = f"no feedback from address {self.address} for {age_s:.2f} s"
             if unknown and self._link.is_open:
                 heard = ", ".join(str(a) for a in unknown)
                 self._faults.set("wrong_address", f"{detail}, but an actuator at address {heard} is heard", now_s)
             else:
                 self._faults.set("no_feedback", detail, now_s)
-        names = self._faults.names()
+        names = self._faults.names(now_s)
         if names & FAILING:
             self._fail()
         elif self._lifecycle is Lifecycle.FAILED:
             self._lifecycle = Lifecycle.STANDBY
-        if self._lifecycle is Lifecycle.ACTIVE and names & DISARMING:
+        if self._lifecycle is Lifecycle.ACTIVE and names & TRIPPING:
             self._lifecycle = Lifecycle.STANDBY
             self.hold()
         thermal = self._thermal
@@ -350,18 +369,22 @@ class ElectrakActuator:
         self._faults.keep("thermal_limit", thermal.limited, f"{load}: no motion until it is cooler", now_s)
         self._faults.keep("thermal_derating", thermal.derating and not thermal.limited, f"{load}: rests added", now_s)
 
+    def _strangers(self, now_s: float) -> list[int]:
+        """Addresses within an Electrak's reach that give an Electrak's feedback and belong to no configured axis."""
+        return [a for a in self._link.strangers(self.feedback_pgn, now_s) if a in SELECTABLE_ADDRESSES]
+
     def _fail(self) -> None:
         if self._lifecycle is not Lifecycle.CLOSED and self._lifecycle is not Lifecycle.FAILED:
             self._lifecycle = Lifecycle.FAILED
             self.hold()
 
-    def _forget(self, now_s: float) -> None:
+    def _forget(self) -> None:
         self._planner.hold()
-        self._monitor.reset(now_s)
-        self._faults.clear(*self._faults.names())
+        self._monitor.reset()
+        self._faults.clear_all()
         self._track.forget()
         self._heard.clear()
-        self._sent, self._sent_enabled = None, False
+        self._sent, self._sent_enabled, self._may_move = None, False, False
         self._overload.rearm()
         self._claimed_name = None
 
@@ -386,13 +409,13 @@ class ElectrakActuator:
             case Lifecycle.ACTIVE:
                 return "It is active already"
         return (
-            "; ".join(fault.detail for fault in self._faults.all(self._clock.now_s()))
+            "; ".join(fault.detail for fault in self._faults.present(self._clock.now_s()))
             or "Wait until its feedback is back"
         )
 
     def _no_feedback_error(self) -> DeviceError:
         now_s = self._clock.now_s()
-        unknown = self._link.unknown_feedback_addresses(now_s)
+        unknown = self._strangers(now_s)
         cause = f"no feedback from address {self.address}"
         remedy = "Check its supply, the 120 ohm terminators and address_n"
         if unknown:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import collections
 from enum import StrEnum
 from typing import Final
 
 from graderd.drivers.j1939.claim import AddressClaimer, ClaimState
 from graderd.hal.errors import DeviceError
-from graderd.hal.fault import DeviceFault
+from graderd.hal.fault import DeviceFault, PresentFaults
 
 
 class BusEvent(StrEnum):
@@ -17,6 +18,8 @@ class BusEvent(StrEnum):
     ERROR_PASSIVE = "error_passive"
     BUS_OFF = "bus_off"
     QUEUE_OVERRUN = "queue_overrun"
+    REFUSED = "refused"
+    """The adapter answered NACK to what it was given: a frame that did not leave, mostly."""
 
 
 def event_of(class_bits: int, data: bytes) -> BusEvent | None:
@@ -35,9 +38,37 @@ def event_of(class_bits: int, data: bytes) -> BusEvent | None:
     return None
 
 
+ERROR_FRAMES: Final[dict[BusEvent, tuple[int, bytes]]] = {
+    BusEvent.BUS_OFF: (0x40, bytes(8)),
+    BusEvent.ERROR_PASSIVE: (0x04, bytes((0, 0x30, 0, 0, 0, 0, 128, 128))),
+    BusEvent.ERROR_ACTIVE: (0x04, bytes((0, 0x40, 0, 0, 0, 0, 0, 0))),
+    BusEvent.QUEUE_OVERRUN: (0x04, bytes((0, 0x01, 0, 0, 0, 0, 0, 0))),
+    BusEvent.REFUSED: (0x01, bytes(8)),
+}
+"""Events as error frames of the Linux kernel: class bits and data. One that was refused is a transmit timeout."""
+
+ERROR_CLASSES: Final = (
+    "transmit_timeout",
+    "arbitration_lost",
+    "controller",
+    "protocol_violation",
+    "transceiver",
+    "no_acknowledgement",
+    "bus_off",
+    "bus_error",
+    "restarted",
+    "error_counters",
+)
+"""What the bits of an error frame's identifier say, from the lowest on."""
+
 FLOOD_HZ: Final = 1200.0
 """Frames a second beyond which the bus counts as flooded: about 75 % of what 250 kbit/s can carry."""
-_OVERRUN_HOLD_S: Final = 2.0
+REFUSED_N: Final = 5
+"""NACKs of the adapter within a second that are a fault. A single one is a lost frame, and is counted."""
+_REFUSED_WINDOW_S: Final = 1.0
+ADDRESS_LOST_S: Final = 0.28
+"""An address that was lost and not replaced for longer is a fault. A new claim takes 0.25 s and a poll of 0.02 s."""
+_OVERRUN_SHOWN_S: Final = 2.0
 _WINDOW_S: Final = 0.5
 _LOST: Final = ("interface_down", "unplugged")
 
@@ -46,55 +77,55 @@ class BusHealth:
     """Collects events and tells the faults of device ``can``."""
 
     def __init__(self) -> None:
-        self._present: dict[str, DeviceFault] = {}
-        self._overrun_at_s: float | None = None
+        self._faults = PresentFaults("can")
         self._window_start_s = 0.0
         self._window_n = 0
+        self._refused_s: collections.deque[float] = collections.deque(maxlen=REFUSED_N)
 
     def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """Conditions present now."""
-        if self._overrun_at_s is not None and now_s - self._overrun_at_s > _OVERRUN_HOLD_S:
-            self._overrun_at_s = None
-            self._clear("queue_overrun")
         if now_s - self._window_start_s > 2 * _WINDOW_S:
-            self._clear("flood")
-        return tuple(self._present.values())
+            self._faults.clear("flood")
+        return self._faults.present(now_s)
 
     def on_open(self) -> None:
         """The bus is open (again): a new start."""
-        self._clear(*_LOST, "bus_off", "error_passive", "queue_overrun")
+        self._faults.clear(*_LOST, "bus_off", "error_passive", "queue_overrun")
 
     def on_lost(self, condition: str, detail: str, now_s: float) -> None:
         """The bus is gone."""
-        self._clear("bus_off", "error_passive", "queue_overrun", "flood")
-        self._set(condition, detail, now_s)
+        self._faults.clear("bus_off", "error_passive", "queue_overrun", "flood")
+        self._faults.set(condition, detail, now_s)
 
     def on_open_failed(self, error: DeviceError, now_s: float) -> None:
         """Opening again failed: an interface that exists and is down is not the same as one that is gone."""
         is_down = "interface is down" in error.cause
-        self._clear(_LOST[is_down])
-        self._set(_LOST[not is_down], error.cause, now_s)
+        self._faults.clear(_LOST[is_down])
+        self._faults.set(_LOST[not is_down], error.cause, now_s)
 
     def on_event(self, event: BusEvent, now_s: float) -> None:
         """An error frame or an adapter's state line."""
         match event:
             case BusEvent.BUS_OFF:
-                self._clear("error_passive", "queue_overrun")
-                self._set("bus_off", "the controller left the bus after too many transmit errors", now_s)
+                self._faults.clear("error_passive", "queue_overrun")
+                self._faults.set("bus_off", "the controller left the bus after too many transmit errors", now_s)
             case BusEvent.ERROR_PASSIVE:
-                self._clear("bus_off")
-                self._set("error_passive", "the controller counts 128 errors or more", now_s)
+                self._faults.clear("bus_off")
+                self._faults.set("error_passive", "the controller counts 128 errors or more", now_s)
             case BusEvent.ERROR_ACTIVE:
-                self._clear("bus_off", "error_passive")
+                self._faults.clear("bus_off", "error_passive")
             case BusEvent.QUEUE_OVERRUN:
-                self._overrun_at_s = now_s
-                self._set("queue_overrun", "received frames were lost", now_s)
+                self._faults.tell("queue_overrun", "received frames were lost", now_s, _OVERRUN_SHOWN_S)
+            case BusEvent.REFUSED:
+                self._refused_s.append(now_s)
+                if len(self._refused_s) == REFUSED_N and now_s - self._refused_s[0] < _REFUSED_WINDOW_S:
+                    detail = f"it answered NACK {REFUSED_N} times within a second"
+                    self._faults.tell("adapter_refuses", detail, now_s, _REFUSED_WINDOW_S)
 
     def on_transmit_full(self, detail: str, now_s: float) -> None:
         """The transmit queue was full; after a bus-off that is only its consequence."""
-        if "bus_off" not in self._present:
-            self._overrun_at_s = now_s
-            self._set("queue_overrun", f"transmit queue full: {detail}", now_s)
+        if "bus_off" not in self._faults.names(now_s):
+            self._faults.tell("queue_overrun", f"transmit queue full: {detail}", now_s, _OVERRUN_SHOWN_S)
 
     def on_traffic(self, frames_n: int, now_s: float) -> None:
         """Count received frames."""
@@ -103,21 +134,18 @@ class BusHealth:
         if elapsed_s < _WINDOW_S:
             return
         rate_hz = self._window_n / elapsed_s
-        if rate_hz > FLOOD_HZ:
-            self._set("flood", f"{rate_hz:.0f} frames a second", now_s)
-        else:
-            self._clear("flood")
+        self._faults.keep("flood", rate_hz > FLOOD_HZ, f"{rate_hz:.0f} frames a second", now_s)
         self._window_start_s, self._window_n = now_s, 0
 
-    def watch_claim(self, claimer: AddressClaimer, now_s: float) -> None:
-        """Turn the state of the address claim into conditions."""
+    def watch_claim(self, claimer: AddressClaimer, lost_for_s: float, now_s: float) -> None:
+        """Turn the state of the address claim into conditions; ``lost_for_s``: an address lost and not replaced yet."""
         address = claimer.wanted
-        lost = claimer.state is ClaimState.CANNOT_CLAIM
+        none_free = claimer.state is ClaimState.CANNOT_CLAIM
         for condition, is_present, detail in (
             (
                 "cannot_claim",
-                lost,
-                f"address {address} is taken and no other is free",
+                none_free or lost_for_s > ADDRESS_LOST_S,
+                f"address {address} is taken" + (" and no other is free" if none_free else " and so is the next"),
             ),
             ("claim_storm", claimer.storming(now_s), f"another node claims address {address} without end"),
             (
@@ -127,16 +155,4 @@ class BusHealth:
                 + (" and our NAME" if claimer.equal_name_seen(now_s) else ""),
             ),
         ):
-            if is_present:
-                self._set(condition, detail, now_s)
-            else:
-                self._clear(condition)
-
-    def _set(self, condition: str, detail: str, now_s: float) -> None:
-        former = self._present.get(condition)
-        since_s = former.since_s if former else now_s
-        self._present[condition] = DeviceFault("can", condition, detail, since_s)
-
-    def _clear(self, *conditions: str) -> None:
-        for condition in conditions:
-            self._present.pop(condition, None)
+            self._faults.keep(condition, is_present, detail, now_s)

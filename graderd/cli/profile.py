@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from graderd.cli.client import daemon_of
-from graderd.cli.console import ExitCode, Json, example, print_json, print_table, print_text
+from graderd.cli.console import ExitCode, Json, client_of, example, print_json, print_table, print_text
 
 SERVICE_S = 30.0
 
@@ -38,7 +37,7 @@ def register(app: typer.Typer) -> None:
 
         Moves nothing. The exit status is 1 where there is a difference.
         """
-        answer = daemon_of(context).service(f"{device.value}.verify_profile", SERVICE_S)
+        answer = client_of(context).service(f"{device.value}.verify_profile", SERVICE_S)
         differences = answer.get("differences", [])
         if json:
             print_json(answer)

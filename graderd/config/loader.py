@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import codecs
 import difflib
 import tomllib
 import types
 import typing
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Tag, ValidationError
 
+from graderd import places
 from graderd.config.models import Config
+from graderd.hal.settings import Settings
 
-DEFAULT_PATHS = (Path("/etc/graderd/graderd.toml"),)
+S = TypeVar("S", bound=Settings)
+
+_MARKS = {codecs.BOM_UTF8: "a byte order mark", codecs.BOM_UTF16_LE: "UTF-16 text", codecs.BOM_UTF16_BE: "UTF-16 text"}
 
 
 class ConfigError(Exception):
@@ -26,23 +31,57 @@ class ConfigError(Exception):
 
 
 def load(path: Path | None = None) -> Config:
-    """Read ``path``, or the first of the default paths that exists, or take the defaults.
+    """Read ``path``, or the default path where a file is there, or take the defaults.
 
     Raises:
         ConfigError: unreadable, not TOML, or not a valid configuration.
     """
-    if path is None:
-        path = next((p for p in DEFAULT_PATHS if p.exists()), None)
+    wanted = path or places.CONFIG
+    try:
+        raw = wanted.read_bytes()
+    except FileNotFoundError as error:
         if path is None:
             return Config()
-    try:
-        text = path.read_text(encoding="utf-8")
+        raise _unreadable(wanted, error, "Name another file with --config") from None
+    except PermissionError as error:
+        remedy = "Run it as root or as a member of the file's group, or name another file with --config"
+        raise _unreadable(wanted, error, remedy) from None
     except OSError as error:
-        raise ConfigError(
-            path, [f"{path}: cannot be read ({error.strerror}). Name another file with --config"]
-        ) from None
+        raise _unreadable(wanted, error, "Name another file with --config") from None
+    return parse_text(decode(raw, wanted), wanted)
+
+
+def _unreadable(path: Path, error: OSError, remedy: str) -> ConfigError:
+    return ConfigError(path, [f"{path}: cannot be read ({error.strerror}). {remedy}"])
+
+
+def decode(raw: bytes, path: Path) -> str:
+    """The file's text, its line ends as ``\\n``.
+
+    Raises:
+        ConfigError: not UTF-8, begins with a byte order mark, or has the line ends of an old Macintosh.
+    """
+    for mark, name in _MARKS.items():
+        if raw.startswith(mark):
+            raise ConfigError(path, [f"{path}:1: begins with {name}, not TOML. Save it as UTF-8 without such a mark"])
+    try:
+        text = raw.decode("utf-8").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
-        raise ConfigError(path, [f"{path}: not UTF-8 text at byte {error.start}. Save it as UTF-8"]) from None
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise ConfigError(path, [f"{path}:{line}: not UTF-8 text at byte {error.start}. Save it as UTF-8"]) from None
+    if "\r" in text:
+        line = text.count("\n", 0, text.index("\r")) + 1
+        cause = "a carriage return without a line feed, which ends no line in TOML"
+        raise ConfigError(path, [f"{path}:{line}: {cause}. Save it with the line ends of Unix or Windows"])
+    return text
+
+
+def parse_text(text: str, path: Path) -> Config:
+    """Check the text of a configuration file.
+
+    Raises:
+        ConfigError: not TOML, or not a valid configuration.
+    """
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -62,16 +101,41 @@ def parse(data: dict[str, Any], path: Path | None = None, text: str = "") -> Con
         return Config.model_validate(data)
     except ValidationError as error:
         where = str(path) if path else "configuration"
-        raise ConfigError(path, [_explain(where, text, dict(e)) for e in error.errors()]) from None
+        raise ConfigError(path, explain(error, Config, where=where, text=text)) from None
 
 
-def _explain(where: str, text: str, error: dict[str, Any]) -> str:
-    location = [str(part) for part in error["loc"]]
+def parse_section(name: str, section: Settings, model: type[S]) -> S:
+    """A section of the configuration as ``model`` takes it: for a driver from elsewhere, which brings its own.
+
+    Raises:
+        ConfigError: as :func:`parse`.
+    """
+    try:
+        return model.model_validate(section.model_dump())
+    except ValidationError as error:
+        raise ConfigError(None, explain(error, model, (name,))) from None
+
+
+def explain(
+    error: ValidationError,
+    model: type[BaseModel],
+    under: tuple[str, ...] = (),
+    *,
+    where: str = "configuration",
+    text: str = "",
+) -> list[str]:
+    """One line per mistake. ``under``: where in the configuration ``model`` belongs."""
+    return [_explain(dict(each), model, list(under), where, text) for each in error.errors()]
+
+
+def _explain(error: dict[str, Any], model: type[BaseModel], under: list[str], where: str, text: str) -> str:
+    inner, parent = _place_of([str(part) for part in error["loc"]], model)
+    location = under + inner
     name = _dotted(location)
     line = _line_of(text, location)
     place = f"{where}:{line}" if line else where
     if error["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(location[-1], _known_keys(location[:-1]), n=1, cutoff=0.5)
+        near = difflib.get_close_matches(location[-1], list(parent.model_fields) if parent else [], n=1, cutoff=0.5)
         remedy = f"Did you mean {_dotted([*location[:-1], near[0]])}?" if near else "Remove it"
         return f"{place}: {name}: unknown key. {remedy}"
     cause = error["msg"].removeprefix("Value error, ")
@@ -87,7 +151,7 @@ def _line_of(text: str, location: list[str]) -> int:
     """Line number of the key, 0 where it cannot be told. TOML parsers keep none, so the text is searched."""
     key, table = location[-1] if location else "", _dotted(location[:-1])
     current = ""
-    for number, raw in enumerate(text.splitlines(), 1):
+    for number, raw in enumerate(text.split("\n"), 1):
         line = raw.strip()
         if line.startswith("["):
             current = line.strip("[]").strip()
@@ -98,19 +162,31 @@ def _line_of(text: str, location: list[str]) -> int:
     return 0
 
 
-def _known_keys(location: list[str]) -> list[str]:
-    """Keys allowed at a place of the configuration."""
-    model: type[BaseModel] | None = Config
-    for part in location:
-        if model is None or part not in model.model_fields:
-            return []
-        model = _model_in(model.model_fields[part].annotation)
-    return list(model.model_fields) if model else []
+def _place_of(parts: list[str], model: type[BaseModel] | None) -> tuple[list[str], type[BaseModel] | None]:
+    """Keys on the way to a mistake, and the model that the last of them belongs to.
+
+    Where a section has several models, pydantic names the tag of the one it took after the section's key; a file has
+    no such word.
+    """
+    location: list[str] = []
+    while parts:
+        location.append(parts.pop(0))
+        if not parts:
+            break
+        field = model.model_fields.get(location[-1]) if model else None
+        models = _models_in(field.annotation) if field else {}
+        model = models[parts.pop(0)] if len(models) > 1 and parts[0] in models else next(iter(models.values()), None)
+    return location, model
 
 
-def _model_in(annotation: Any) -> type[BaseModel] | None:
+def _models_in(annotation: Any) -> dict[str, type[BaseModel]]:
+    """The models that may stand somewhere, by their tag; one without a tag by its name."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
+        return {annotation.__name__: annotation}
+    if typing.get_origin(annotation) is typing.Annotated:
+        inner, *notes = typing.get_args(annotation)
+        tag = next((note.tag for note in notes if isinstance(note, Tag)), None)
+        return {tag or name: model for name, model in _models_in(inner).items()}
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        return next((m for a in typing.get_args(annotation) if (m := _model_in(a))), None)
-    return None
+        return {name: model for each in typing.get_args(annotation) for name, model in _models_in(each).items()}
+    return {}

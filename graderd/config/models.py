@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.core.attitude import AttitudeGeometry, Preset
@@ -16,14 +16,22 @@ from graderd.core.lift_pair import LiftPairSettings
 from graderd.core.machine import MachineSettings
 from graderd.core.rule import RuleSettings
 from graderd.hal.settings import (
+    IN_TREE,
+    PLUGIN,
     ActuatorSettings,
+    AnyRotatorSettings,
+    AnyStopInputSettings,
     CameraSettings,
     CanSettings,
+    ElectrakSettings,
     NotNegative,
+    Ph54Settings,
+    PluginActuatorSettings,
+    PluginCameraSettings,
     Positive,
-    RotatorSettings,
     Settings,
     StopInputSettings,
+    tag_of,
 )
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
 
@@ -66,7 +74,7 @@ class RecordingSettings(Settings):
 
     directory: str = Field("", description="empty: nothing is recorded")
     rate_hz: Positive = Field(10.0, le=50)
-    max_mb: NotNegative = Field(500.0, description="oldest recordings go first")
+    max_mb: NotNegative = Field(500.0, description="oldest go first, incidents last")
     min_free_mb: NotNegative = Field(200.0, description="recording pauses below this; control goes on")
 
 
@@ -96,20 +104,26 @@ LIFT_SPEED = Field(
 )
 
 
-class LiftLeftSection(ActuatorSettings):
+class PluginCameraSection(PluginCameraSettings):
+    """A camera by a driver from elsewhere, with its calibration."""
+
+    calibration: CameraCalibration = Field(default_factory=CameraCalibration)
+
+
+class LiftLeftSection(ElectrakSettings):
     """The left lift: an Electrak HD with no address pin wired."""
 
     speed_percent: int = LIFT_SPEED
 
 
-class LiftRightSection(ActuatorSettings):
+class LiftRightSection(ElectrakSettings):
     """The right lift: the same unit with address select 1."""
 
     address_n: int = Field(20, ge=0, le=253)
     speed_percent: int = LIFT_SPEED
 
 
-class TiltSection(ActuatorSettings):
+class TiltSection(ElectrakSettings):
     """The tilt: an Electrak MD of 500 N and 100 mm."""
 
     address_n: int = Field(27, ge=0, le=253)
@@ -133,19 +147,30 @@ def _presets() -> dict[str, Preset]:
     }
 
 
+_Plugin = Annotated[PluginActuatorSettings, Tag(PLUGIN)]
+
+
 class Config(Settings):
     """Everything. Sections that are absent take their defaults."""
 
     version: Literal[2] = 2
     simulated: bool = False
-    camera: CameraSection = Field(default_factory=CameraSection)
+    camera: Annotated[
+        Annotated[CameraSection, Tag(IN_TREE)] | Annotated[PluginCameraSection, Tag(PLUGIN)], Discriminator(tag_of)
+    ] = Field(default_factory=CameraSection)
     perception: PerceptionSettings = Field(default_factory=PerceptionSettings)
     blade: BladeGeometry = Field(default_factory=BladeGeometry)
-    rotation: RotatorSettings = Field(default_factory=RotatorSettings)
+    rotation: AnyRotatorSettings = Field(default_factory=Ph54Settings)
     can: CanSettings = Field(default_factory=CanSettings)
-    lift_left: LiftLeftSection = Field(default_factory=LiftLeftSection)
-    lift_right: LiftRightSection = Field(default_factory=LiftRightSection)
-    tilt: TiltSection = Field(default_factory=TiltSection)
+    lift_left: Annotated[Annotated[LiftLeftSection, Tag(IN_TREE)] | _Plugin, Discriminator(tag_of)] = Field(
+        default_factory=LiftLeftSection
+    )
+    lift_right: Annotated[Annotated[LiftRightSection, Tag(IN_TREE)] | _Plugin, Discriminator(tag_of)] = Field(
+        default_factory=LiftRightSection
+    )
+    tilt: Annotated[Annotated[TiltSection, Tag(IN_TREE)] | _Plugin, Discriminator(tag_of)] = Field(
+        default_factory=TiltSection
+    )
     attitude: AttitudeGeometry = Field(default_factory=AttitudeGeometry)
     lift_pair: LiftPairSettings = Field(default_factory=LiftPairSettings)
     rule: RuleSettings = Field(default_factory=RuleSettings)
@@ -155,19 +180,19 @@ class Config(Settings):
     api: ApiSettings = Field(default_factory=ApiSettings)
     recording: RecordingSettings = Field(default_factory=RecordingSettings)
     state: StateSettings = Field(default_factory=StateSettings)
-    stop_input: StopInputSettings = Field(default_factory=StopInputSettings)
+    stop_input: AnyStopInputSettings = Field(default_factory=StopInputSettings)
     presets: dict[str, Preset] = Field(default_factory=_presets)
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
-        addresses = [
-            self.lift_left.address_n,
-            self.lift_right.address_n,
-            self.tilt.address_n,
-            self.can.source_address_n,
-        ]
-        if len(set(addresses)) != len(addresses):
-            raise ValueError(f"lift_left, lift_right, tilt and can need four different addresses, not {addresses}")
+        electraks = {name: axis for name, axis in self.actuators().items() if isinstance(axis, ElectrakSettings)}
+        addresses = {name: axis.address_n for name, axis in electraks.items()} | {"can": self.can.source_address_n}
+        if len(set(addresses.values())) != len(addresses):
+            *some, last = addresses
+            raise ValueError(
+                f"{', '.join(some)} and {last} need {len(addresses)} different addresses, not "
+                f"{list(addresses.values())}"
+            )
         for zone, angle_deg in (
             ("left_deg", self.rule.left_deg),
             ("right_deg", self.rule.right_deg),
@@ -191,26 +216,32 @@ class Config(Settings):
         """What a detector or a dead man needs of other settings and does not get: one line each, with its remedy."""
         tick_s = 1.0 / self.control.tick_hz
         rotation, pair = self.rotation, self.lift_pair
-        poll_s = 1.0 / rotation.poll_hz
-        ticks, polls = ("control.tick_hz", tick_s), ("rotation.poll_hz", poll_s)
+        ticks = ("control.tick_hz", tick_s)
+        unseen_s = [rotation.max_age_s, rotation.goal_timeout_s]
         needs = [
             ("machine.lease_s", self.machine.lease_s, 2, ticks),
             ("rotation.goal_timeout_s", rotation.goal_timeout_s, 2, ticks),
             *((f"{axis}.target_timeout_s", own.target_timeout_s, 2, ticks) for axis, own in self.actuators().items()),
             ("control.overrun_s", self.control.overrun_s, 1, ticks),
             ("lift_pair.silent_s", pair.silent_s, 1, ticks),
-            ("rotation.max_age_s", rotation.max_age_s, 2, polls),
-            ("rotation.reply_timeout_s", rotation.reply_timeout_s, 2, polls),
-            ("rotation.watchdog_s", rotation.watchdog_s, 2, polls),
-            ("rotation.not_moving_s", rotation.not_moving_s, 3, polls),
+            ("rotation.not_moving_s", rotation.not_moving_s, 3, ticks),
         ]
+        if isinstance(rotation, Ph54Settings):
+            polls = ("rotation.poll_hz", 1.0 / rotation.poll_hz)
+            needs += [
+                ("rotation.max_age_s", rotation.max_age_s, 2, polls),
+                ("rotation.reply_timeout_s", rotation.reply_timeout_s, 2, polls),
+                ("rotation.watchdog_s", rotation.watchdog_s, 2, polls),
+                ("rotation.not_moving_s", rotation.not_moving_s, 3, polls),
+            ]
+            unseen_s.append(rotation.watchdog_s)
         for name, value_s, periods_n, (rate, period_s) in needs:
             if value_s < periods_n * period_s - 1e-9:
                 yield (
                     f"{name} ({value_s:g}) is shorter than {periods_n} periods of {rate} ({1.0 / period_s:g}): what it "
                     "watches could not come in time; raise the one or the other"
                 )
-        unseen_deg = rotation.speed_deg_per_s * max(rotation.max_age_s, rotation.goal_timeout_s, rotation.watchdog_s)
+        unseen_deg = rotation.speed_deg_per_s * max(unseen_s)
         if unseen_deg > UNSEEN_DEG:
             yield (
                 f"rotation.speed_deg_per_s ({rotation.speed_deg_per_s:g}) with rotation.max_age_s, goal_timeout_s "
@@ -223,7 +254,7 @@ class Config(Settings):
                     f"lift_pair.reading_max_age_s ({pair.reading_max_age_s:g}) is above {axis}.max_age_s "
                     f"({section.max_age_s:g}): the pair would never name the side that is lost; lower it"
                 )
-            if pair.min_share * section.speed_percent < LEAST_DUTY_PERCENT:
+            if isinstance(section, ElectrakSettings) and pair.min_share * section.speed_percent < LEAST_DUTY_PERCENT:
                 yield (
                     f"lift_pair.min_share ({pair.min_share:g}) of {axis}.speed_percent ({section.speed_percent}) is "
                     f"below the {LEAST_DUTY_PERCENT} % duty at which a lift moves; raise it"

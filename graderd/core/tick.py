@@ -7,7 +7,7 @@ every replay. ``graderd.runtime.control`` senses, calls and acts; status, DM1, r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -20,10 +20,11 @@ from graderd.core.gate import AxisPass, GateInputs, GateSettings, GateState, pas
 from graderd.core.lift_pair import LiftCoordinator, LiftPairSettings, SideReading
 from graderd.core.machine import ARMED, Inputs, Intents, MachineSettings, Mode, State, step
 from graderd.core.motion import resolve
+from graderd.core.plausibility import AxisSample, MotionFigures, PlausibilityMonitor, axis_sample
 from graderd.core.readiness import AxisReadiness, Requirement, requirements
 from graderd.core.rule import RuleSettings
 from graderd.core.soil import SoilObservation
-from graderd.hal.fault import DeviceFault
+from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
@@ -31,7 +32,6 @@ from graderd.hal.rotator import RotatorTelemetry
 
 BLOCKED_S = 0.5
 """A tick this late: goals have timed out and the servo's watchdog (0.2 s by default) has tripped meanwhile."""
-OVERRUN_SHOWN_S = 1.0
 LAPSE_SHOWN_S = 3.0
 
 
@@ -39,10 +39,12 @@ LAPSE_SHOWN_S = 3.0
 class TickSettings:
     """What the tick goes by: the configuration, without anything that belongs to a device or a process.
 
-    ``overrun_s``: a tick later than this is a fault. ``max_frame_age_s``: the soil of an older picture is unknown.
+    ``motion``: what is plausible for each axis. ``overrun_s``: a tick later than this is a fault.
+    ``max_frame_age_s``: the soil of an older picture is unknown.
     """
 
     figures: Mapping[str, AxisFigures]
+    motion: Mapping[str, MotionFigures]
     machine: MachineSettings = field(default_factory=MachineSettings)
     rule: RuleSettings = field(default_factory=RuleSettings)
     gate: GateSettings = field(default_factory=GateSettings)
@@ -148,8 +150,8 @@ class Controller:
         self._soil: SoilObservation | None = None
         self._now_s: float | None = None
         self._overruns_n = 0
-        self._late: tuple[float, float] | None = None
-        self._lapse: tuple[str, float] | None = None
+        self._plausibility = PlausibilityMonitor(settings.motion)
+        self._own_faults = PresentFaults("daemon")
 
     def step(self, sensed: Sensed) -> Tick:
         """Decide once. ``sensed.now_s`` never goes back."""
@@ -282,31 +284,24 @@ class Controller:
         }
 
     def _present(self, sensed: Sensed) -> list[DeviceFault]:
-        found = [*sensed.faults, *self._lift.faults()]
-        if self._late is not None and sensed.now_s - self._late[1] < OVERRUN_SHOWN_S:
-            late_s, at_s = self._late
-            detail = f"tick {late_s * 1e3:.0f} ms late, {self._overruns_n} overruns"
-            found.append(DeviceFault("daemon", "loop_blocked" if late_s > BLOCKED_S else "tick_overrun", detail, at_s))
-        if self._lapse is not None and sensed.now_s - self._lapse[1] < LAPSE_SHOWN_S:
-            found.append(DeviceFault("daemon", "lease_lapsed", f"client {self._lapse[0] or '?'}", self._lapse[1]))
-        return found
+        implausible = self._plausibility.judge(_samples(sensed), sensed.now_s)
+        return [*sensed.faults, *implausible, *self._lift.faults(), *self._own_faults.present(sensed.now_s)]
 
     def _readiness(self, sensed: Sensed, pose: Pose) -> tuple[Requirement, ...]:
         axes = {name: AxisReadiness(axis.lifecycle, axis.problem, pose[name]) for name, axis in sensed.axes.items()}
         return requirements(self._state, axes, self._settings.figures, self._faults.active)
 
     def _note_late(self, late_s: float, now_s: float) -> None:
-        """The worst of the last moments is told: small delays after a long one must not hide it."""
         if late_s <= self._settings.overrun_s:
             return
         self._overruns_n += 1
-        if self._late is None or late_s >= self._late[0] or now_s - self._late[1] > OVERRUN_SHOWN_S:
-            self._late = (late_s, now_s)
+        detail = f"tick {late_s * 1e3:.0f} ms late, {self._overruns_n} overruns"
+        self._own_faults.tell("loop_blocked" if late_s > BLOCKED_S else "tick_overrun", detail, now_s)
 
     def _note_lapse(self, before: State, now_s: float) -> None:
         lapsed = before.lease is not None and self._state.lease is None and now_s > before.lease.expires_s
         if lapsed and before.lease is not None and self._state.mode in ARMED:
-            self._lapse = (before.lease.client, now_s)
+            self._own_faults.tell("lease_lapsed", f"client {before.lease.client or '?'}", now_s, LAPSE_SHOWN_S)
 
 
 def _unlatching(state: State, commands: tuple[cmd.AnyCommand, ...]) -> Clear | None:
@@ -332,6 +327,14 @@ def _pose_of(sensed: Sensed, figures: Mapping[str, AxisFigures]) -> Pose:
 
 def _fresh(reading: Reading[float] | None, now_s: float, max_age_s: float) -> float | None:
     return reading.value if reading is not None and reading.is_fresh(now_s, max_age_s) else None
+
+
+def _samples(sensed: Sensed) -> Iterator[AxisSample]:
+    """What each axis does and was told; an axis without a valid position: nothing."""
+    for axis, told in sensed.axes.items():
+        sample = axis_sample(axis, told.lifecycle, told.telemetry)
+        if sample is not None:
+            yield sample
 
 
 def _side(sensed: Sensed, axis: str) -> SideReading | None:

@@ -16,6 +16,8 @@ class ActuatorTelemetry:
 
     ``flags`` names the device's own flags that are set (``overload``, ``backdrive``, ``parameter``, ``saturation``,
     ``fatal``, ``voltage_low``, ``voltage_high``, ``temperature_low``, ``temperature_high``).
+    ``goal_mm`` is where the device is driving the axis to now; None while it lets it stay (held, arrived, resting by
+    itself). With the position it tells plausible motion from implausible, so every driver gives it.
     ``thermal_load`` is the share of the allowed I²t budget in use (1.0 = limit).
     """
 
@@ -26,6 +28,7 @@ class ActuatorTelemetry:
     moving: Reading[bool] | None = None
     flags: Reading[frozenset[str]] | None = None
     target_sent_mm: Reading[float] | None = None
+    goal_mm: float | None = None
     thermal_load: float = 0.0
     counters: dict[str, int] = field(default_factory=dict)
 
@@ -33,6 +36,16 @@ class ActuatorTelemetry:
     def position(self) -> Reading[float] | None:
         """The extension, by the name that every axis has for it."""
         return self.position_mm
+
+    @property
+    def velocity(self) -> Reading[float] | None:
+        """Its speed, likewise."""
+        return self.velocity_mm_per_s
+
+    @property
+    def goal(self) -> float | None:
+        """Its goal, likewise."""
+        return self.goal_mm
 
 
 class LinearActuator(Protocol):

@@ -16,7 +16,11 @@ from graderd.hal.reading import Reading
 
 @dataclass(frozen=True, slots=True)
 class RotatorTelemetry:
-    """The newest readings; a field is None until the device gave it once. All from one telemetry block."""
+    """The newest readings; a field is None until the device gave it once. All from one telemetry block.
+
+    ``goal_deg`` is where the device is driving the blade to now; None while it lets it stay (held, not powered). With
+    the angle it tells plausible motion from implausible, so every driver gives it.
+    """
 
     angle_deg: Reading[float] | None = None
     velocity_deg_per_s: Reading[float] | None = None
@@ -27,6 +31,7 @@ class RotatorTelemetry:
     moving: Reading[bool] | None = None
     in_position: Reading[bool] | None = None
     goal_sent_deg: Reading[float] | None = None
+    goal_deg: float | None = None
     torque_on: Reading[bool] | None = None
     counters: dict[str, int] = field(default_factory=dict)
 
@@ -34,6 +39,16 @@ class RotatorTelemetry:
     def position(self) -> Reading[float] | None:
         """The angle, by the name that every axis has for it."""
         return self.angle_deg
+
+    @property
+    def velocity(self) -> Reading[float] | None:
+        """Its speed, likewise."""
+        return self.velocity_deg_per_s
+
+    @property
+    def goal(self) -> float | None:
+        """Its goal, likewise."""
+        return self.goal_deg
 
 
 class Rotator(Protocol):

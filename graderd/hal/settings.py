@@ -1,13 +1,19 @@
 """Settings of the devices, as the drivers take them. ``graderd.config`` composes them into the configuration file.
 
 Every number carries its unit in its name. Unknown keys are errors. Ranges are the device's where a manual gives them.
+
+Each device names its driver: one of graderd's own by a word, or one that comes from elsewhere as
+``package.module:NAME`` (docs/developers/add-a-device.md). What every driver of a device takes stands in the base class;
+a driver from elsewhere has its own keys in the section's table ``driver`` and a model of its own that checks them.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import difflib
+import re
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, JsonValue, Tag, model_validator
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -24,27 +30,51 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
 
+_PLUGIN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+PLUGIN: Literal["plugin"] = "plugin"
+"""Tag of the models that take a driver from elsewhere."""
+IN_TREE: Literal["in_tree"] = "in_tree"
+"""Tag of the models of graderd's own drivers."""
+
+
+def is_plugin(name: str) -> bool:
+    """Whether ``name`` is a driver from elsewhere, ``package.module:NAME``."""
+    return _PLUGIN.fullmatch(name) is not None
+
+
+def _one_of(*own: str) -> AfterValidator:
+    """A driver's name: one of graderd's own, or a plug-in."""
+
+    def check(name: str) -> str:
+        if name in own or is_plugin(name):
+            return name
+        near = difflib.get_close_matches(name, own, n=1)
+        remedy = f"Did you mean {near[0]}?" if near else "Name another's driver as package.module:NAME"
+        raise ValueError(f"no such driver; there is {', '.join(own)}. {remedy}")
+
+    return AfterValidator(check)
+
+
+def tag_of(section: Any) -> str:
+    """The tag of a section's model, told by the driver that it names."""
+    if isinstance(section, dict):
+        name = section.get("backend", section.get("source"))
+    else:
+        name = getattr(section, "backend", getattr(section, "source", None))
+    return PLUGIN if isinstance(name, str) and is_plugin(name) else IN_TREE
+
+
+DriverTable = Annotated[
+    dict[str, JsonValue], Field(default_factory=dict, description="the driver's own keys, checked by its own model")
+]
+
+
 class RotatorSettings(Settings):
-    """Blade rotation: ROBOTIS PH54-200-S500-R on a serial port.
+    """Blade rotation, whatever turns it."""
 
-    Calibration: ``blade_deg = sign * servo_deg / gear_ratio - zero_deg`` with servo_deg from the device's own zero
-    (Homing Offset stays 0).
-    """
-
-    port: str = Field("/dev/graderd/servo", description="serial port, or a udev symlink to it")
-    usb_serial_number: str = Field("", description="find the port by the adapter's USB serial number; empty: use port")
-    baud_n: int = Field(57_600, gt=0, description="bits per second; the factory setting of the PH54 is 57,600")
-    servo_id_n: int = Field(1, ge=0, le=252)
-    profile: str = Field("ph54_200_s500", description="name of the control table in firmware_profiles")
-    zero_deg: Finite = Field(
-        0.0, ge=-360, le=360, description="blade angle read at the servo's zero, subtracted; within one turn"
-    )
-    sign: Literal[1, -1] = Field(1, description="-1 where the servo turns the blade the other way round")
-    gear_ratio: Positive = Field(
-        1.0, ge=0.1, le=20, description="servo turns for one blade turn; beyond that its angle or its speed is none"
-    )
-    min_deg: Finite = Field(-60.0, ge=-180, le=180, description="limit at the blade, for gate and servo alike")
-    max_deg: Finite = Field(60.0, ge=-180, le=180, description="limit at the blade, for gate and servo alike")
+    backend: Annotated[str, _one_of("ph54")] = Field("ph54", description="driver: ph54, or package.module:NAME")
+    min_deg: Finite = Field(-60.0, ge=-180, le=180, description="limit at the blade, for gate and driver alike")
+    max_deg: Finite = Field(60.0, ge=-180, le=180, description="limit at the blade, for gate and driver alike")
     window_deg: Positive = Field(
         120.0, le=360, description="largest distance from where the blade stood when it was armed; 360: no window"
     )
@@ -65,25 +95,14 @@ class RotatorSettings(Settings):
         le=2.5,
         description="an older angle counts as unknown: the rotation holds; 2.5 s only where it turns slowly",
     )
-    current_limit_a: Positive = Field(9.3, le=22.74, description="9.3 A is the continuous rating")
-    watchdog_s: Positive = Field(0.2, le=2.54, description="the servo's own bus watchdog, steps of 20 ms")
-    poll_hz: Positive = Field(50.0, le=200, description="telemetry reads a second")
     goal_timeout_s: Positive = Field(
         0.2,
         le=1.0,
         description="a goal not renewed for so long becomes a hold: the blade turns no longer after a dead tick",
     )
-    reply_timeout_s: Positive = Field(
-        0.25, le=1.5, description="no valid reply for so long: the servo is lost; its own watchdog acts before"
-    )
     not_moving_s: Positive = Field(
         0.7, ge=0.3, le=5.0, description="goal ahead and no movement for so long: the motor would heat up against a jam"
     )
-    voltage_warn_low_v: Positive = Field(20.0, le=30, description="below that a warning; the servo takes 24 V")
-    voltage_warn_high_v: Positive = Field(30.0, le=35, description="above that a warning")
-    temperature_warn_c: Positive = Field(70.0, le=80, description="a warning before the servo switches off at 80 °C")
-    torque_at_disarm: Literal["off", "on"] = "off"
-    torque_at_exit: Literal["off", "on"] = "off"
 
     @model_validator(mode="after")
     def _limits(self) -> RotatorSettings:
@@ -93,7 +112,7 @@ class RotatorSettings(Settings):
 
     @property
     def profile_velocity_deg_per_s(self) -> float:
-        """The servo's own profile: faster than the goal moves, so that following it is no second regulator."""
+        """The driver's own profile: faster than the goal moves, so that following it is no second regulator."""
         return PROFILE_MARGIN * self.speed_deg_per_s
 
     @property
@@ -102,8 +121,51 @@ class RotatorSettings(Settings):
         return PROFILE_MARGIN * self.acceleration_deg_per_s2
 
 
+class Ph54Settings(RotatorSettings):
+    """Blade rotation: ROBOTIS PH54-200-S500-R on a serial port.
+
+    Calibration: ``blade_deg = sign * servo_deg / gear_ratio - zero_deg`` with servo_deg from the device's own zero
+    (Homing Offset stays 0).
+    """
+
+    port: str = Field("/dev/graderd/servo", description="serial port, or a udev symlink to it")
+    usb_serial_number: str = Field("", description="find the port by the adapter's USB serial number; empty: use port")
+    baud_n: int = Field(57_600, gt=0, description="bits per second; the factory setting of the PH54 is 57,600")
+    servo_id_n: int = Field(1, ge=0, le=252)
+    profile: str = Field("ph54_200_s500", description="name of the control table in firmware_profiles")
+    zero_deg: Finite = Field(
+        0.0, ge=-360, le=360, description="blade angle read at the servo's zero, subtracted; within one turn"
+    )
+    sign: Literal[1, -1] = Field(1, description="-1 where the servo turns the blade the other way round")
+    gear_ratio: Positive = Field(
+        1.0, ge=0.1, le=20, description="servo turns for one blade turn; beyond that its angle or its speed is none"
+    )
+    current_limit_a: Positive = Field(9.3, le=22.74, description="9.3 A is the continuous rating")
+    watchdog_s: Positive = Field(0.2, le=2.54, description="the servo's own bus watchdog, steps of 20 ms")
+    poll_hz: Positive = Field(50.0, le=200, description="telemetry reads a second")
+    reply_timeout_s: Positive = Field(
+        0.25, le=1.5, description="no valid reply for so long: the servo is lost; its own watchdog acts before"
+    )
+    voltage_warn_low_v: Positive = Field(20.0, le=30, description="below that a warning; the servo takes 24 V")
+    voltage_warn_high_v: Positive = Field(30.0, le=35, description="above that a warning")
+    temperature_warn_c: Positive = Field(70.0, le=80, description="a warning before the servo switches off at 80 °C")
+    torque_at_disarm: Literal["off", "on"] = "off"
+    torque_at_exit: Literal["off", "on"] = "off"
+
+
+class PluginRotatorSettings(RotatorSettings):
+    """Blade rotation by a driver from elsewhere."""
+
+    driver: DriverTable
+
+
+AnyRotatorSettings = Annotated[
+    Annotated[Ph54Settings, Tag(IN_TREE)] | Annotated[PluginRotatorSettings, Tag(PLUGIN)], Discriminator(tag_of)
+]
+
+
 class CanSettings(Settings):
-    """The J1939 bus of the actuators, opened by python-can."""
+    """The J1939 bus, opened by python-can."""
 
     interface: Literal["socketcan", "slcan", "virtual"] = "socketcan"
     channel: str = Field("can0", description="network interface, or the port of an slcan adapter")
@@ -126,10 +188,11 @@ class CanSettings(Settings):
 
 
 class ActuatorSettings(Settings):
-    """One Electrak on the J1939 bus. The three instances are ``lift_left``, ``lift_right`` and ``tilt``."""
+    """One linear actuator, whatever it is. The three instances are ``lift_left``, ``lift_right`` and ``tilt``."""
 
-    address_n: int = Field(19, ge=0, le=253, description="J1939 source address of the actuator")
-    profile: str = Field("electrak_hd_b017", description="name of the layout in firmware_profiles")
+    backend: Annotated[str, _one_of("electrak")] = Field(
+        "electrak", description="driver: electrak, or package.module:NAME"
+    )
     min_mm: NotNegative = Field(5.0, le=1000, description="limit of extension, for gate and driver alike")
     max_mm: Positive = Field(295.0, le=1000, description="limit of extension, for gate and driver alike")
     window_mm: Positive = Field(
@@ -151,20 +214,10 @@ class ActuatorSettings(Settings):
     max_age_s: Positive = Field(
         0.4, ge=0.25, le=2.5, description="an older position counts as unknown; feedback comes every 105 ms"
     )
-    current_limit_a: Positive = Field(18.0, le=25.0)
-    speed_percent: int = Field(80, ge=20, le=100, multiple_of=5, description="motor duty in full-speed moves")
-    feedback_timeout_s: Positive = Field(
-        0.35, ge=0.25, le=1.0, description="three missing feedback messages: the actuator is lost"
-    )
     target_timeout_s: Positive = Field(
         0.3,
         le=1.0,
         description="a target not renewed for so long becomes a hold: the axis moves no longer after a dead tick",
-    )
-    overload_retries_n: int = Field(0, ge=0, le=5, description="automatic retries after an overload before it latches")
-    figures: dict[str, NotNegative] = Field(
-        default_factory=dict,
-        description="measured figures that replace the profile's, for example {speed_no_load_mm_per_s = 24.5}",
     )
 
     @model_validator(mode="after")
@@ -174,11 +227,37 @@ class ActuatorSettings(Settings):
         return self
 
 
+class ElectrakSettings(ActuatorSettings):
+    """One Electrak on the J1939 bus."""
+
+    address_n: int = Field(19, ge=0, le=253, description="J1939 source address of the actuator")
+    profile: str = Field("electrak_hd_b017", description="name of the layout in firmware_profiles")
+    current_limit_a: Positive = Field(18.0, le=25.0)
+    speed_percent: int = Field(80, ge=20, le=100, multiple_of=5, description="motor duty in full-speed moves")
+    feedback_timeout_s: Positive = Field(
+        0.35, ge=0.25, le=1.0, description="three missing feedback messages: the actuator is lost"
+    )
+    overload_retries_n: int = Field(0, ge=0, le=5, description="automatic retries after an overload before it latches")
+    figures: dict[str, NotNegative] = Field(
+        default_factory=dict,
+        description="measured figures that replace the profile's, for example {speed_no_load_mm_per_s = 24.5}",
+    )
+
+
+class PluginActuatorSettings(ActuatorSettings):
+    """One linear actuator by a driver from elsewhere; its stroke is not graderd's to guess."""
+
+    min_mm: NotNegative = Field(description="limit of extension, for gate and driver alike")
+    max_mm: Positive = Field(description="limit of extension, for gate and driver alike")
+    driver: DriverTable
+
+
 class StopInputSettings(Settings):
     """A normally closed loop whose opening stops the machine: buttons, gate switches, a contact of the safety relay."""
 
-    backend: Literal["none", "serial", "gpio", "simulated"] = Field(
-        "none", description="serial: modem lines of a serial port; gpio: two lines of a GPIO chip"
+    backend: Annotated[str, _one_of("none", "serial", "gpio", "simulated")] = Field(
+        "none",
+        description="serial: modem lines of a serial port; gpio: two lines of a GPIO chip; or package.module:NAME",
     )
     port: str = Field("", description="serial port, GPIO chip (/dev/gpiochip0), or the simulated loop's socket")
     drive: Literal["rts", "dtr"] = Field("rts", description="serial: output that drives the loop")
@@ -204,10 +283,24 @@ class StopInputSettings(Settings):
         return self
 
 
+class PluginStopInputSettings(StopInputSettings):
+    """A stop input by a driver from elsewhere."""
+
+    driver: DriverTable
+
+
+AnyStopInputSettings = Annotated[
+    Annotated[StopInputSettings, Tag(IN_TREE)] | Annotated[PluginStopInputSettings, Tag(PLUGIN)], Discriminator(tag_of)
+]
+
+
 class CameraSettings(Settings):
     """Where pictures come from and how the camera is set."""
 
-    source: Literal["realsense", "recording", "rig", "folder", "video", "frame_set"] = "realsense"
+    source: Annotated[str, _one_of("realsense", "recording", "rig", "folder", "video", "frame_set")] = Field(
+        "realsense",
+        description="realsense, recording, rig, folder, video, frame_set, or a driver's package.module:NAME",
+    )
     path: str = Field("", description="recording, folder, video, frame set, or the rig's camera socket")
     serial_number: str = Field("", description="of the RealSense camera; empty: the only one attached")
     color_width_px: int = Field(1280, gt=0)
@@ -223,3 +316,14 @@ class CameraSettings(Settings):
         0.5, le=60, description="no frame for so long: unknown at once; a minute only with pictures that come as slowly"
     )
     restart_s: Positive = Field(2.0, le=600, description="no frame for so long: the worker process is restarted")
+
+
+class PluginCameraSettings(CameraSettings):
+    """A camera by a driver from elsewhere."""
+
+    driver: DriverTable
+
+
+AnyCameraSettings = Annotated[
+    Annotated[CameraSettings, Tag(IN_TREE)] | Annotated[PluginCameraSettings, Tag(PLUGIN)], Discriminator(tag_of)
+]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import OrderedDict
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -19,8 +20,17 @@ from graderd.perception.decide import Verdict, fuse
 from graderd.perception.depth import DepthJudge, HeightMap
 from graderd.perception.geometry import CENTER, LEFT, RIGHT, U8, Region, View, blade_region, image_thirds
 from graderd.perception.health import HealthMonitor, KnockWatch
-from graderd.perception.settings import CameraCalibration, DecisionSettings, Mounting, PerceptionSettings
+from graderd.perception.settings import (
+    CameraCalibration,
+    ColorSettings,
+    DecisionSettings,
+    Mounting,
+    PerceptionSettings,
+)
 
+ColorMethod = Callable[[U8, Region, ColorSettings, DecisionSettings], Verdict]
+BY_COLOR: Mapping[str, ColorMethod] = {"paper": paper_verdict, "fast_color": fast_color_verdict}
+"""The methods that look at the colour picture alone, by ``perception.method``."""
 ANGLE_STEP_DEG = 0.25
 KEPT_REGIONS_N = 64
 
@@ -160,8 +170,8 @@ class SoilClassifier:
         faults = self._health.blurred(frame.color_bgr, region)
         if faults:
             return Verdict(Zone.UNKNOWN, 0.0, ""), faults
-        if settings.method in ("paper", "fast_color"):
-            by_color = paper_verdict if settings.method == "paper" else fast_color_verdict
+        by_color = BY_COLOR.get(settings.method)
+        if by_color is not None:
             verdict = by_color(frame.color_bgr, region, settings.color, settings.decision)
             return self._said(frame, verdict), self._knocked_meanwhile(frame, angle_deg)
         judge = self._depth_judge(frame)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -16,6 +16,7 @@ from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.rotator import Rotator
+from graderd.hal.service import DeviceService
 
 RETRY_S = 1.0
 
@@ -58,6 +59,8 @@ class Devices:
     rotation: Rotator
     link: Link
     actuators: dict[str, LinearActuator]
+    services: Mapping[str, DeviceService] = field(default_factory=dict)
+    """What the drivers offer besides, as ``device.name``; what a driver has not is absent."""
     publish_faults: Callable[[tuple[DeviceFault, ...], bool], None] = _publish_nowhere
     """Puts the active faults, and whether the machine is stopped, on the bus as diagnostic messages (DM1)."""
     watch_bus: Callable[[Callable[[str], None]], Callable[[], None]] = _watch_nothing
@@ -128,7 +131,7 @@ class PowerSequencer:
                     await device.disarm()  # left over from before: arming anew writes and verifies everything
                 await device.arm()
             except DeviceError as error:
-                log.warning("arming %s failed: %s", name, error)
+                log.warning("arming %s failed: %s", name, error, extra={"event": True, "device": name})
                 self._error = str(error)
                 return
 
@@ -141,7 +144,7 @@ class PowerSequencer:
                     await device.disarm()
             except DeviceError as error:
                 # The device keeps its own dead man; the fault it reports says the rest.
-                log.warning("disarming %s failed: %s", name, error)
+                log.warning("disarming %s failed: %s", name, error, extra={"event": True, "device": name})
 
     async def close(self) -> None:
         """End the task under way."""
@@ -157,7 +160,7 @@ async def _finished(task: asyncio.Task[None] | None) -> None:
 
 
 async def open_devices(devices: Devices) -> None:
-    """Open the bus, then all axes side by side; every failure is told once per cause and tried again."""
+    """Open the bus, then all axes side by side. What fails is told and tried again; the log repeats it more rarely."""
     async with asyncio.TaskGroup() as group:
         group.create_task(_keep_trying("rotation", devices.rotation.open, devices.problems), name="open-rotation")
         group.create_task(_open_bus(devices), name="open-can")
@@ -175,11 +178,10 @@ async def _keep_trying(name: str, open_device: Callable[[], Awaitable[None]], pr
         try:
             await open_device()
         except DeviceError as error:
-            if problems.get(name) != str(error):
-                log.warning("%s: cannot be opened: %s", name, error)
-                problems[name] = str(error)
+            log.warning("%s: cannot be opened: %s", name, error, extra={"device": name})
+            problems[name] = str(error)
             await asyncio.sleep(RETRY_S)
         else:
             problems.pop(name, None)
-            log.info("%s: open", name)
+            log.info("%s: open", name, extra={"device": name})
             return

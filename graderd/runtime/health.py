@@ -8,11 +8,11 @@ import time
 from pathlib import Path
 
 from graderd.config import Config
-from graderd.hal.fault import DeviceFault
+from graderd.hal.fault import DeviceFault, PresentFaults
 
 LOOK_EVERY_S = 1.0
 STEP_S = 2.0
-FAULT_SHOWN_S = 10.0
+STEP_SHOWN_S = 10.0
 
 
 class HealthWatch:
@@ -21,8 +21,7 @@ class HealthWatch:
     def __init__(self, config: Config) -> None:
         self._limit_mb = config.control.memory_warn_mb
         self._offset_s = time.time() - time.monotonic()
-        self._step: tuple[float, float] | None = None
-        self._memory_mb = 0.0
+        self._faults = PresentFaults("daemon")
 
     async def run(self) -> None:
         """Look once a second until cancelled."""
@@ -32,22 +31,18 @@ class HealthWatch:
 
     def look(self) -> None:
         """Take one measurement."""
-        offset_s = time.time() - time.monotonic()
-        if abs(offset_s - self._offset_s) > STEP_S:
-            self._step = (offset_s - self._offset_s, time.monotonic())
-        self._offset_s = offset_s
-        self._memory_mb = _resident_mb()
+        now_s = time.monotonic()
+        offset_s = time.time() - now_s
+        step_s, self._offset_s = offset_s - self._offset_s, offset_s
+        if abs(step_s) > STEP_S:
+            self._faults.tell("clock_stepped", f"the wall clock was stepped by {step_s:+.0f} s", now_s, STEP_SHOWN_S)
+        memory_mb = _resident_mb()
+        detail = f"{memory_mb:.0f} MB in use, {self._limit_mb:g} MB expected at most"
+        self._faults.keep("memory_high", memory_mb > self._limit_mb, detail, now_s)
 
     def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """What was seen."""
-        found = []
-        if self._step is not None and now_s - self._step[1] < FAULT_SHOWN_S:
-            detail = f"the wall clock was stepped by {self._step[0]:+.0f} s"
-            found.append(DeviceFault("daemon", "clock_stepped", detail, self._step[1]))
-        if self._memory_mb > self._limit_mb:
-            detail = f"{self._memory_mb:.0f} MB in use, {self._limit_mb:g} MB expected at most"
-            found.append(DeviceFault("daemon", "memory_high", detail, now_s))
-        return tuple(found)
+        return self._faults.present(now_s)
 
 
 def _resident_mb() -> float:

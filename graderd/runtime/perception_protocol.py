@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import SoilObservation
-from graderd.hal.settings import CameraSettings
+from graderd.hal.settings import AnyCameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
 
 _OBSERVATION: TypeAdapter[SoilObservation] = TypeAdapter(SoilObservation)
@@ -29,7 +29,7 @@ class Start(_Message):
     """Everything the child needs to know."""
 
     kind: Literal["start"] = "start"
-    camera: CameraSettings
+    camera: AnyCameraSettings
     calibration: CameraCalibration
     perception: PerceptionSettings
     blade: BladeGeometry

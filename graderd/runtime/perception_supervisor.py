@@ -21,7 +21,7 @@ from graderd.core.soil import SoilObservation
 from graderd.core.status import CameraStatus
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError
-from graderd.hal.fault import DeviceFault
+from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
@@ -46,10 +46,15 @@ BACK_OFF_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 RESTART_SHOWN_S = 5.0
 FUTURE_S = 0.1
 """Both processes read one clock; a frame further ahead of it than this is none."""
+COMPLAINTS_S = 0.5
+COMPLAINTS_EVERY_S = 0.01
+COMPLAINTS_BYTES = 65_536
+COMPLAINTS_N = 20
 MAX_LINE_BYTES = 8 * 1024 * 1024
 MAX_UNSENT_BYTES = 64 * 1024
 
 log = logging.getLogger(__name__)
+_FIELDS = {"device": "camera"}
 
 
 class PerceptionSupervisor:
@@ -80,9 +85,10 @@ class PerceptionSupervisor:
         self._last_word_s = clock.now_s()
         self._no_frame_since_s = clock.now_s()
         self._opened_s = clock.now_s()
-        self._restarted_s: float | None = None
         self._killed_hung = False
-        self._nonsense: tuple[str, float] | None = None
+        self._picture_faults = PresentFaults("camera")
+        self._worker_faults = PresentFaults("camera")
+        self._nonsense = PresentFaults("daemon")
         self._opens_without_frame_n = 0
         self._restarts_n = 0
         self._frame_times: deque[float] = deque(maxlen=30)
@@ -136,24 +142,19 @@ class PerceptionSupervisor:
     def faults(self) -> tuple[DeviceFault, ...]:
         """What is wrong with camera, worker and picture now."""
         now_s = self._clock.now_s()
-        found = []
+        seen: dict[str, str] = {}
         if self._is_stale():
             condition, detail = "stale", f"no frame for {now_s - self._no_frame_since_s:.1f} s"
             if self._problem is not None and self._problem.final:
                 condition, detail = self._problem.condition, self._problem.message
-            found.append(DeviceFault("camera", condition, detail, self._no_frame_since_s))
+            seen[condition] = detail
         elif self._newest is not None:
-            found += [DeviceFault("camera", f.condition, f.detail, self._newest.capture_s) for f in self._newest.faults]
-        if self._restarted_s is not None and now_s - self._restarted_s < RESTART_SHOWN_S:
-            condition = "worker_hung" if self._killed_hung else "worker_restarted"
-            found.append(DeviceFault("camera", condition, f"restart {self._restarts_n}", self._restarted_s))
-        if self._nonsense is not None and now_s - self._nonsense[1] < RESTART_SHOWN_S:
-            found.append(DeviceFault("daemon", "perception_nonsense", *self._nonsense))
+            seen |= {fault.condition: fault.detail for fault in self._newest.faults}
         if self._opened is not None and self._opened.not_kept:
-            found.append(
-                DeviceFault("camera", "settings_not_kept", "; ".join(self._opened.not_kept), self._last_word_s)
-            )
-        return tuple(found)
+            seen["settings_not_kept"] = "; ".join(self._opened.not_kept)
+        self._picture_faults.keep_only(seen, now_s)
+        books = (self._picture_faults, self._worker_faults, self._nonsense)
+        return tuple(fault for book in books for fault in book.present(now_s))
 
     def _is_stale(self) -> bool:
         return self._clock.now_s() - self._no_frame_since_s > self._camera.stale_s
@@ -205,9 +206,10 @@ class PerceptionSupervisor:
                 await self._one_child()
                 self._restarts_n += 1
                 self._opens_without_frame_n += 1
-                self._restarted_s = self._clock.now_s()
+                restart = "worker_hung" if self._killed_hung else "worker_restarted"
+                self._worker_faults.tell(restart, f"restart {self._restarts_n}", self._clock.now_s(), RESTART_SHOWN_S)
                 pause_s = self._back_off_s[min(self._opens_without_frame_n, len(self._back_off_s)) - 1]
-                log.warning("perception worker ended (restart %d in %.1f s)", self._restarts_n, pause_s)
+                log.warning("perception worker ended (restart %d in %.1f s)", self._restarts_n, pause_s, extra=_FIELDS)
                 await asyncio.sleep(pause_s)
         finally:
             await self._kill()
@@ -218,7 +220,11 @@ class PerceptionSupervisor:
         self._last_word_s = self._clock.now_s() + self._start_grace_s - self._camera.restart_s
         starting = asyncio.ensure_future(
             asyncio.create_subprocess_exec(
-                *self._command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=MAX_LINE_BYTES
+                *self._command,
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.PIPE,
+                limit=MAX_LINE_BYTES,
             )
         )
         try:
@@ -231,11 +237,18 @@ class PerceptionSupervisor:
         start = self._start.model_copy(update={"reset_first": reset_first})
         self._process.stdin.write(start.model_dump_json().encode() + b"\n")
         self._killed_hung = False
+        assert self._process.stderr is not None
+        complaints = asyncio.create_task(_log_complaints(self._process.stderr), name="perception-complaints")
         try:
             while await self._one_line(self._process.stdout):
                 pass
         finally:
-            await self._kill()
+            try:
+                await self._kill()
+                # Dead, its pipe ends by itself, unless a process that it left behind holds it.
+                await asyncio.wait((complaints,), timeout=COMPLAINTS_S)
+            finally:
+                complaints.cancel()
 
     async def _one_line(self, lines: asyncio.StreamReader) -> bool:
         """Handle the child's next line. False: it ended, spoke nonsense or has been silent for too long."""
@@ -245,10 +258,10 @@ class PerceptionSupervisor:
                 line = await lines.readline()
         except TimeoutError:
             self._killed_hung = True
-            log.warning("perception worker said nothing for %.1f s: killing it", self._camera.restart_s)
+            log.warning("perception worker said nothing for %.1f s: killing it", self._camera.restart_s, extra=_FIELDS)
             return False
         except ValueError:
-            log.warning("perception worker sent an overlong line: killing it")
+            log.warning("perception worker sent an overlong line: killing it", extra=_FIELDS)
             return False
         if not line:
             return False
@@ -258,8 +271,8 @@ class PerceptionSupervisor:
             return self._take(message)
         except ValueError as error:  # pydantic's ValidationError is one
             detail = str(error).splitlines()[0]
-            self._nonsense = (detail, self._clock.now_s())
-            log.warning("perception worker sent what cannot be true (%s): killing it", detail)
+            self._nonsense.tell("perception_nonsense", detail, self._clock.now_s(), RESTART_SHOWN_S)
+            log.warning("perception worker sent what cannot be true (%s): killing it", detail, extra=_FIELDS)
             return False
 
     def _take(self, message: Opened | Observed | CameraProblem | Preview | Saved) -> bool:
@@ -275,10 +288,9 @@ class PerceptionSupervisor:
         elif isinstance(message, Opened):
             self._opened, self._problem = message, None
             self._opened_s = self._last_word_s
-            log.info("camera open: %s", message.description)
+            log.info("camera open: %s", message.description, extra=_FIELDS)
         elif isinstance(message, CameraProblem):
-            if self._problem is None or self._problem.message != message.message:
-                log.warning("camera: %s", message.message)
+            log.warning("camera: %s", message.message, extra={**_FIELDS, "fault": f"camera.{message.condition}"})
             self._problem = message
             # Alive but without frames for too long: the ladder goes on all the same. The time a child took to start
             # does not count against it, or none that starts slowly would ever get to its first frame.
@@ -304,3 +316,13 @@ class PerceptionSupervisor:
         # Forgotten only when it is reaped: cancelled while waiting here, run() comes here again.
         await process.wait()
         self._process = None
+
+
+async def _log_complaints(stream: asyncio.StreamReader) -> None:
+    """What the child and the libraries in it print on standard error, through our log: a child that fails at every
+    start would else fill the journal past all its limits. Of a torrent, each piece's first and last lines are told."""
+    while data := await stream.read(COMPLAINTS_BYTES):
+        lines = [line for line in data.decode("utf-8", "replace").splitlines() if line.strip()]
+        for line in lines if len(lines) <= 2 * COMPLAINTS_N else lines[:COMPLAINTS_N] + lines[-COMPLAINTS_N:]:
+            log.warning("perception worker: %s", line, extra=_FIELDS)
+        await asyncio.sleep(COMPLAINTS_EVERY_S)

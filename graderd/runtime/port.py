@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
+from collections.abc import AsyncGenerator, Mapping
 from typing import Any
 
 from graderd.api.port import ServiceError
 from graderd.config import Config
-from graderd.core.commands import Command, Reply
+from graderd.core.commands import Command, Reply, Stop
 from graderd.core.machine import Mode
 from graderd.core.status import Status
 from graderd.hal.errors import DeviceError
+from graderd.hal.service import DeviceService
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 from graderd.runtime.status import build_status
 
-Service = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 BUS_LINES_N = 2000
 """More than a second of a full bus."""
 BUS_PAUSE_S = 0.05
 """Frames come in bundles: a message for each would cost more than the bus itself."""
-SERVICES_IN_ANY_MODE = frozenset({"rotation.verify_profile"})
 
 
 class Port:
@@ -35,7 +34,7 @@ class Port:
         loop: ControlLoop,
         devices: Devices,
         eyes: PerceptionSupervisor,
-        services: Mapping[str, Service],
+        services: Mapping[str, DeviceService],
     ) -> None:
         self._config = config
         self._loop = loop
@@ -71,7 +70,10 @@ class Port:
 
     async def command(self, command: Command) -> Reply:
         """Hand a command to the next tick; stop acts at once."""
-        return await self._loop.command(command)
+        reply = await self._loop.command(command)
+        if isinstance(command, Stop):
+            self._cached = None  # it acted between two ticks: who asks now sees the machine stopped
+        return reply
 
     def config(self) -> dict[str, Any]:
         """The resolved configuration."""
@@ -116,7 +118,7 @@ class Port:
             raise ServiceError(f"there is no service '{name}'", f"there are: {known}")
         arguments = dict(arguments)
         consent = bool(arguments.pop("consent", False))
-        if name not in SERVICES_IN_ANY_MODE:
+        if not service.only_reads:
             if not consent:
                 raise ServiceError(
                     f"{name} may move or unpower the blade", "repeat with consent when the area is clear"
@@ -124,6 +126,6 @@ class Port:
             if (mode := self._loop.tick.state.mode) is not Mode.DISARMED:
                 raise ServiceError(f"{name} needs a disarmed machine; it is {mode}", "disarm first")
         try:
-            return await service(arguments)
+            return await service.run(arguments)
         except DeviceError as error:
             raise ServiceError(f"{error.where}: {error.cause}", error.remedy) from error

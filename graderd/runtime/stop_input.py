@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceError
-from graderd.hal.fault import DeviceFault
+from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.settings import StopInputSettings
 from graderd.hal.stop_input import StopInput
 
@@ -47,7 +47,7 @@ class StopInputWatch:
         self._on_stop = on_stop
         self._ending = threading.Event()
         self._word = _Word("lost", f"{source.where} was not read yet", clock.now_s())
-        self._since_s = clock.now_s()
+        self._faults = PresentFaults(DEVICE)
         self._quiet_until_s = clock.now_s() + FIRST_WORD_S
         self._asked_s = clock.now_s()
         self._grace_until_s = clock.now_s()
@@ -63,11 +63,11 @@ class StopInputWatch:
         if now_s < self._quiet_until_s:
             return ()
         age_s = now_s - word.time_s
+        seen = {word.condition: word.detail} if word.condition else {}
         if age_s > self._settings.stale_s and word.condition != "lost" and now_s >= self._grace_until_s:
-            return (DeviceFault(DEVICE, "stale", f"{self._source.where}: no reading for {age_s:.2f} s", word.time_s),)
-        if word.condition:
-            return (DeviceFault(DEVICE, word.condition, word.detail, self._since_s),)
-        return ()
+            seen = {"stale": f"{self._source.where}: no reading for {age_s:.2f} s"}
+        self._faults.keep_only(seen, now_s)
+        return self._faults.present(now_s)
 
     async def run(self) -> None:
         """Watch until cancelled. The thread ends by itself, or with the process where its port never returns."""
@@ -84,9 +84,11 @@ class StopInputWatch:
         while not self._ending.is_set():
             try:
                 self._source.open()
-                log.info("stop input: %s", self._source.where)
+                log.info("stop input: %s", self._source.where, extra={"device": DEVICE})
                 self._look_on(loop)
             except DeviceError as error:
+                # At every attempt: the log repeats it ever more rarely.
+                log.warning("stop input: %s", error, extra={"device": DEVICE, "fault": f"{DEVICE}.lost"})
                 self._say(loop, "lost", str(error))
                 self._ending.wait(RETRY_S)
         self._source.close()
@@ -116,9 +118,10 @@ class StopInputWatch:
         self._quiet_until_s = now_s
         if condition == former.condition:
             return
-        self._since_s = now_s
         if condition:
-            log.warning("stop input: %s", detail)
+            if condition != "lost":
+                fields = {"event": True, "device": DEVICE, "fault": f"{DEVICE}.{condition}"}
+                log.warning("stop input: %s", detail, extra=fields)
             try:
                 loop.call_soon_threadsafe(self._on_stop, detail)
             except RuntimeError:

@@ -17,18 +17,18 @@ from graderd.drivers.dynamixel import safe_off
 from graderd.drivers.dynamixel.arming import watchdog_counts
 from graderd.hal.errors import DeviceMissingError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 from tests.dynamixel_sim import PATIENCE_S, bench, servo_process, until
 
 # A daemon in miniature: arms, turns for ever, says when it is under way.
 CLIENT = """
 import asyncio, sys
 from graderd.drivers.dynamixel import Ph54Rotator
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 async def main():
-    r = Ph54Rotator(RotatorSettings(port=sys.argv[1], speed_deg_per_s=16.7))
+    r = Ph54Rotator(Ph54Settings(port=sys.argv[1], speed_deg_per_s=16.7))
     await r.open()
     await r.arm()
     while True:
@@ -45,7 +45,7 @@ asyncio.run(main())
 def test_from_loss_of_link_to_standstill_the_watchdog_bounds_it(
     tmp_path: Path, way: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    watchdog_s = RotatorSettings().watchdog_s
+    watchdog_s = Ph54Settings().watchdog_s
     with servo_process(tmp_path / "servo") as servo:
         client = subprocess.Popen([sys.executable, "-c", CLIENT, str(servo.link)], stdout=subprocess.PIPE, text=True)
         try:
@@ -84,7 +84,7 @@ async def test_the_bound_from_the_last_packet_to_standstill_in_the_servos_own_ti
     servo = VirtualServo()
     servo.advance(0.0)
     servo.write(556, (600).to_bytes(4, "little") + (500).to_bytes(4, "little") + (150_000).to_bytes(4, "little"))
-    servo.write(546, bytes((watchdog_counts(RotatorSettings()),)))
+    servo.write(546, bytes((watchdog_counts(Ph54Settings()),)))
     servo.write(512, b"\x01")
     servo.write(564, (150_000).to_bytes(4, "little"))
     now_s = 0.0
@@ -100,7 +100,7 @@ async def test_the_bound_from_the_last_packet_to_standstill_in_the_servos_own_ti
     while abs(servo.shaft_velocity_deg_per_s) > 0.5:
         now_s += 0.001
         servo.advance(now_s)
-    assert now_s - last_s <= RotatorSettings().watchdog_s == 0.2
+    assert now_s - last_s <= Ph54Settings().watchdog_s == 0.2
 
 
 @pytest.mark.parametrize(("at_exit", "torque_on"), [("off", False), ("on", True)])
@@ -140,7 +140,7 @@ async def test_safe_off_after_the_daemon_died(tmp_path: Path, at_exit: str) -> N
     await wire.start()
     servo.write(512, b"\x01")
     servo.write(564, (0).to_bytes(4, "little"))
-    settings = RotatorSettings(port=str(wire.link), torque_at_exit=at_exit)
+    settings = Ph54Settings(port=str(wire.link), torque_at_exit=at_exit)
     text = await asyncio.to_thread(safe_off, settings)
     assert "rotation" in text
     assert servo.torque_enabled is (at_exit == "on")
@@ -150,15 +150,15 @@ async def test_safe_off_after_the_daemon_died(tmp_path: Path, at_exit: str) -> N
 
 async def test_safe_off_says_what_is_wrong(tmp_path: Path) -> None:
     with pytest.raises(DeviceMissingError):
-        safe_off(RotatorSettings(port=str(tmp_path / "none")))
+        safe_off(Ph54Settings(port=str(tmp_path / "none")))
     wire = VirtualServoBus([VirtualServo()], tmp_path / "servo")
     await wire.start()
     wire.inject("drop")
     with pytest.raises(DeviceTimeoutError, match="safe-off"):
-        await asyncio.to_thread(safe_off, RotatorSettings(port=str(wire.link)))
+        await asyncio.to_thread(safe_off, Ph54Settings(port=str(wire.link)))
     wire.clear_faults()
     wire.inject("flip", rate=0.3)
-    await asyncio.to_thread(safe_off, RotatorSettings(port=str(wire.link)))
+    await asyncio.to_thread(safe_off, Ph54Settings(port=str(wire.link)))
     await wire.close()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -209,7 +208,8 @@ async def test_commanded_but_not_moving(rig: Bench) -> None:
 async def test_moving_uncommanded_while_armed(rig: Bench) -> None:
     await armed_at(rig, 0.0)
     rig.rotator.hold()
-    await asyncio.sleep(1.5)
+    held_s = rig.clock.now_s()
+    await rig.until(lambda: not rig.conditions() and rig.clock.now_s() > held_s + 1.0)
     rig.bus.inject("push", torque_nm=55.0)  # more than the current limit holds
     await rig.until(lambda: "moving_uncommanded" in rig.conditions())
     rig.bus.clear_faults()
@@ -219,7 +219,8 @@ async def test_moving_uncommanded_while_armed(rig: Bench) -> None:
 
 
 async def test_moving_uncommanded_while_unpowered(rig: Bench) -> None:
-    await asyncio.sleep(0.5)
+    begun_s = rig.clock.now_s()
+    await rig.until(lambda: not rig.conditions() and rig.clock.now_s() > begun_s + 0.5)
     rig.bus.inject("push", torque_nm=10.0)
     await rig.until(lambda: "moving_uncommanded" in rig.conditions())
     rig.bus.clear_faults()
@@ -242,8 +243,8 @@ async def test_moving_the_wrong_way(rig: Bench) -> None:
 async def test_reversing_and_holding_raise_nothing(rig: Bench) -> None:
     await rig.rotator.arm()
     for goal_deg in (50.0, -50.0, 50.0):
-        begun_s = asyncio.get_running_loop().time()
-        await rig.drive(goal_deg, lambda s=begun_s: asyncio.get_running_loop().time() - s > 0.8)  # type: ignore[misc]
+        begun_s = rig.clock.now_s()
+        await rig.drive(goal_deg, lambda s=begun_s: rig.conditions() or rig.clock.now_s() - s > 0.8)  # type: ignore[misc]
         assert not rig.conditions()
     rig.rotator.hold()
     for _ in range(60):

@@ -12,7 +12,7 @@ from graderd.drivers.dynamixel import Ph54Rotator
 from graderd.drivers.dynamixel.servo_task import ServoTask
 from graderd.hal.errors import DeviceError, DeviceMissingError, DeviceRefusedError, DeviceTimeoutError, WrongDeviceError
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
 from tests.dynamixel_sim import Bench, bench, standing, until, works_again
 
@@ -50,7 +50,7 @@ async def test_replug_under_another_name_is_found_by_usb_serial_number(tmp_path:
     servo = VirtualServo()
     wire = VirtualServoBus([servo], tmp_path / "ttyUSB0")
     adapters = [Adapter("/dev/ttyS0", None), Adapter(str(tmp_path / "ttyUSB0"), "FT4THV9P")]
-    settings = RotatorSettings(port="/dev/null/nothing", usb_serial_number="FT4THV9P")
+    settings = Ph54Settings(port="/dev/null/nothing", usb_serial_number="FT4THV9P")
     rotator = Ph54Rotator(settings, list_ports=lambda: list(adapters))
     await wire.start()
     try:
@@ -72,12 +72,12 @@ async def test_replug_under_another_name_is_found_by_usb_serial_number(tmp_path:
 
 
 async def test_opening_without_port_or_servo_says_what_to_do(tmp_path: Path) -> None:
-    nowhere = Ph54Rotator(RotatorSettings(port=str(tmp_path / "none")))
+    nowhere = Ph54Rotator(Ph54Settings(port=str(tmp_path / "none")))
     with pytest.raises(DeviceMissingError, match="no such serial port"):
         await nowhere.open()
     assert nowhere.lifecycle is Lifecycle.CLOSED
     assert [f.condition for f in nowhere.faults()] == ["unplugged"]
-    absent = Ph54Rotator(RotatorSettings(usb_serial_number="X1"), list_ports=lambda: [Adapter("/dev/ttyUSB7", "Y2")])
+    absent = Ph54Rotator(Ph54Settings(usb_serial_number="X1"), list_ports=lambda: [Adapter("/dev/ttyUSB7", "Y2")])
     with pytest.raises(DeviceMissingError, match=r"X1.*Y2 at /dev/ttyUSB7"):
         await absent.open()
     async with bench(tmp_path, opened=False, servo_id_n=5) as rig:

@@ -37,14 +37,15 @@ async def keep_asking(axis: ElectrakActuator, target_mm: float, seconds: float) 
         await asyncio.sleep(0.02)
 
 
-async def time_until(axis: ElectrakActuator, condition: str, loop: SimulatedLoop, target_mm: float | None) -> float:
-    """Seconds until the condition is reported; fails after five."""
+async def time_until(machine: Machine, condition: str, target_mm: float | None) -> float:
+    """Seconds until the condition of the left lift is reported; fails after five."""
+    axis, loop = machine.axes["lift_left"], machine.clock
     start_s = loop.now_s()
     while loop.now_s() - start_s < 5.0:
-        if condition in conditions(axis):
+        if condition in machine.conditions("lift_left"):
             return loop.now_s() - start_s
         await keep_asking(axis, target_mm, 0.02) if target_mm is not None else await asyncio.sleep(0.02)
-    raise AssertionError(f"{condition} was not reported; present: {conditions(axis)}")
+    raise AssertionError(f"{condition} was not reported; present: {machine.conditions('lift_left')}")
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ CASES = [
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c.fault}-{'moving' if c.moving else 'resting'}-{c.condition}")
 def test_fault_is_named_in_time_ends_motion_and_goes_away(case: Case) -> None:
     async def main(loop: SimulatedLoop) -> None:
-        async with Machine(loop, names=LEFT) as machine:
+        async with Machine(loop, names=LEFT, watched=True) as machine:
             axis, unit = machine.axes["lift_left"], machine.units["lift_left"]
             await axis.arm()
             target_mm = 280.0 if case.moving else None
@@ -97,7 +98,7 @@ def test_fault_is_named_in_time_ends_motion_and_goes_away(case: Case) -> None:
                 unit.behaviour.speed_factor = 0.0  # a broken screw: the motor turns freely, nothing moves
             else:
                 machine.bus.inject(case.fault, address=None, **params)
-            took_s = await time_until(axis, case.condition, loop, target_mm)
+            took_s = await time_until(machine, case.condition, target_mm)
             assert took_s <= case.within_s
             assert state(axis) is case.ends
             if case.ends is not Lifecycle.ACTIVE:
@@ -110,7 +111,7 @@ def test_fault_is_named_in_time_ends_motion_and_goes_away(case: Case) -> None:
             await asyncio.sleep(2.5)
             if state(axis) is Lifecycle.STANDBY:
                 await axis.arm()
-            assert conditions(axis) == set()
+            assert machine.conditions("lift_left") == set()
             assert state(axis) is Lifecycle.ACTIVE
             await machine.drive({"lift_left": 150.0}, 8.0)
             assert unit.position_mm == pytest.approx(150.0, abs=1.2)
@@ -187,7 +188,7 @@ def test_the_bias_is_learned_where_a_unit_rests_shorter_than_the_profile_says() 
     run_simulated(main)
 
 
-def test_an_overload_is_retried_as_often_as_configured_and_then_latches() -> None:
+def test_an_overload_is_retried_as_often_as_configured_and_then_ends_active() -> None:
     async def main(loop: SimulatedLoop) -> None:
         async with Machine(loop, names=LEFT, overload_retries_n=2, current_limit_a=10.0) as machine:
             axis, unit = machine.axes["lift_left"], machine.units["lift_left"]
@@ -201,12 +202,15 @@ def test_an_overload_is_retried_as_often_as_configured_and_then_latches() -> Non
             assert axis.telemetry().counters["overloads_n"] == 1
             assert state(axis) is Lifecycle.ACTIVE
             unit.load_n = 1600.0
-            await keep_asking(axis, 280.0, 6.0)
+            await time_until(machine, "overload", 280.0)
             assert axis.telemetry().counters["overloads_n"] == 3
             assert state(axis) is Lifecycle.STANDBY
             (fault,) = axis.faults()
             assert fault.name == "lift_left.overload"
             assert "2 retries used up" in fault.detail
+            await asyncio.sleep(3.0)
+            assert axis.faults() == (), "the driver says what is; that it was is the fault catalogue's to remember"
+            assert state(axis) is Lifecycle.STANDBY
             unit.load_n = 0.0
             await axis.arm()
             assert axis.faults() == ()
@@ -226,7 +230,7 @@ def test_heat_brings_rests_before_the_limit_and_the_limit_is_not_reached() -> No
                 await keep_asking(axis, 285.0 if unit.position_mm < 150.0 else 6.0, 1.0)
                 unit.position_mm = 60.0
                 seen |= conditions(axis)
-                axis._monitor.reset(loop.now_s())
+                axis._monitor.reset()
                 if state(axis) is Lifecycle.STANDBY:
                     await axis.arm()
             assert "thermal_derating" in seen

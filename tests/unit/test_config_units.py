@@ -55,7 +55,7 @@ FIELDS = sorted({*numeric_fields(Config, set()), *numeric_fields(Status, set())}
 
 def test_the_walk_finds_the_fields() -> None:
     assert len(FIELDS) > 150
-    assert "RotatorSettings.speed_deg_per_s" in FIELDS
+    assert "Ph54Settings.speed_deg_per_s" in FIELDS
     assert "FaultStatus.age_s" in FIELDS
 
 

@@ -15,7 +15,7 @@ from graderd.config import Config
 from graderd.core.axes import AXES, LIFTS, Goals, Pose
 from graderd.core.gate import LONGEST_STEP_S, STANDING_S, GateInputs, GateSettings, GateState, Setpoint, pass_gate
 from graderd.core.machine import ARMED, Mode
-from graderd.hal.settings import ActuatorSettings, RotatorSettings
+from graderd.hal.settings import ElectrakSettings, Ph54Settings
 
 SETTINGS = GateSettings()
 FIGURES = Config().figures()
@@ -383,6 +383,6 @@ def test_armed_modes_move(mode: Mode) -> None:
 
 def test_limits_in_the_wrong_order_are_refused() -> None:
     with pytest.raises(ValueError, match="below"):
-        RotatorSettings(min_deg=10.0, max_deg=10.0)
+        Ph54Settings(min_deg=10.0, max_deg=10.0)
     with pytest.raises(ValueError, match="below"):
-        ActuatorSettings(min_mm=10.0, max_mm=5.0)
+        ElectrakSettings(min_mm=10.0, max_mm=5.0)

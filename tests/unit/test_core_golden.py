@@ -237,7 +237,7 @@ def fault_answers() -> Iterator[tuple[str, Any]]:
     script = [
         (100.0, all_of), (100.1, all_of), (100.2, [*all_of[:2]]), (100.3, []), (100.4, all_of[:1]), (100.45, []),
         (100.5, all_of[:1]), (100.65, all_of[:1]), (100.7, all_of[:1]),
-        (100.8, [replace(all_of[1], latched=True), *all_of[3:5]]),
+        (100.8, all_of[3:5]),
     ]  # fmt: skip
     for now_s, present in script:
         state = update_faults(state, present, now_s, catalogue)

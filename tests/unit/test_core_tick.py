@@ -46,11 +46,23 @@ KEPT_EVERY_N = 3
 SETTINGS = tick_settings(Config())
 
 
-def standing(now_s: float, at: dict[str, float], lifecycle: Lifecycle = Lifecycle.ACTIVE) -> dict[str, AxisSensed]:
-    """Every axis measured this moment."""
+def standing(
+    now_s: float,
+    at: dict[str, float],
+    lifecycle: Lifecycle = Lifecycle.ACTIVE,
+    goals: dict[str, float] | None = None,
+) -> dict[str, AxisSensed]:
+    """Every axis measured this moment; ``goals``: where their devices are driving them to."""
+    goals = goals or {}
+    turned = RotatorTelemetry(angle_deg=Reading(at["rotation"], now_s), goal_deg=goals.get("rotation"))
     return {
-        "rotation": AxisSensed(lifecycle, RotatorTelemetry(angle_deg=Reading(at["rotation"], now_s))),
-        **{axis: AxisSensed(lifecycle, ActuatorTelemetry(position_mm=Reading(at[axis], now_s))) for axis in ACTUATORS},
+        "rotation": AxisSensed(lifecycle, turned),
+        **{
+            axis: AxisSensed(
+                lifecycle, ActuatorTelemetry(position_mm=Reading(at[axis], now_s), goal_mm=goals.get(axis))
+            )
+            for axis in ACTUATORS
+        },
     }
 
 
@@ -60,6 +72,7 @@ HOME = {"rotation": 0.0, "lift_left": 100.0, "lift_right": 100.0, "tilt": 50.0}
 def stretch_of_work() -> list[Sensed]:
     """Arm, jog, preset, automatic with soil on the left, fault, late tick, stop, reset: on a machine that follows."""
     controller, found, at, powered = Controller(SETTINGS), [], dict(HOME), False
+    goals: dict[str, float] = {}
     commands: dict[int, tuple[cmd.AnyCommand, ...]] = {
         5: (cmd.Arm(client="a"),),
         10: (cmd.Jog(axis="rotate", value=6.0, client="a"),),
@@ -76,7 +89,7 @@ def stretch_of_work() -> list[Sensed]:
         seen = SoilObservation(now_s - 0.03, Zone.LEFT, 0.9, "", 0.8, 0.15, 0.05, frame_number=number)
         sensed = Sensed(
             now_s,
-            standing(now_s, at, Lifecycle.ACTIVE if powered else Lifecycle.STANDBY),
+            standing(now_s, at, Lifecycle.ACTIVE if powered else Lifecycle.STANDBY, goals),
             faults=(DeviceFault("lift_left", "no_feedback", "0.4 s", now_s),) if 200 <= number < 210 else (),
             commands=commands.get(number, ()),
             observation=seen if number > 95 and number % 2 else None,
@@ -86,7 +99,12 @@ def stretch_of_work() -> list[Sensed]:
         )
         tick = controller.step(sensed)
         powered = tick.intents.power
-        at |= {axis: decided.send for axis, decided in tick.axes.items() if decided.send is not None}
+        goals = {
+            axis: decided.send if decided.send is not None else goals[axis]
+            for axis, decided in tick.axes.items()
+            if decided.send is not None or (axis in goals and not decided.hold)
+        }
+        at |= goals
         found.append(sensed)
     return found
 
@@ -161,8 +179,8 @@ def test_a_held_axis_has_not_arrived() -> None:
     step = partial(Sensed, powered=True)
     controller.step(Sensed(1.0, standing(1.0, at, Lifecycle.STANDBY), commands=(cmd.Arm(),)))
     controller.step(step(1.02, standing(1.02, at)))
-    controller.step(step(1.04, standing(1.04, at), commands=(cmd.Jog(axis="rotate", value=5.0),)))
-    tick = controller.step(step(1.06, standing(1.06, at | {"rotation": 5.0})))
+    controller.step(step(1.04, standing(1.04, at), commands=(cmd.Jog(axis="rotate", value=2.0),)))
+    tick = controller.step(step(1.06, standing(1.06, at | {"rotation": 2.0}, goals={"rotation": 2.0})))
     assert tick.axes["rotation"].arrived
     low = DeviceFault("rotation", "voltage_low", "18 V", 1.0)
     for number in range(200):

@@ -213,7 +213,7 @@ def row_of(fault: DeviceFault) -> str:
 def reaction_of(fault: DeviceFault) -> Reaction:
     """The reaction of a fault that counts at once; of one that has to last first, nothing is said."""
     row = CATALOGUE[row_of(fault)]
-    return row.reaction if not row.debounce_s and not fault.latched else Reaction.WARN
+    return row.reaction if not row.debounce_s else Reaction.WARN
 
 
 def held_now(sensed: Sensed, auto: bool) -> frozenset[str]:
@@ -311,7 +311,7 @@ class World:
             part, _, condition = chance.choice(list(CATALOGUE)).partition(".")
             device = chance.choice(ACTUATORS) if part == "actuator" else part
             if not (device == "daemon" and condition in ("loop_blocked", "tick_overrun", "lease_lapsed")):
-                fault = DeviceFault(device, condition, "", self.now_s, latched=chance.random() < 0.2)
+                fault = DeviceFault(device, condition, "", self.now_s)
                 self.faults[fault.name] = (fault, chance.choice((1, 2, 10, 50)))
 
     def _observation(self) -> SoilObservation | None:

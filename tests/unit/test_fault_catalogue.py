@@ -30,15 +30,17 @@ CONDITIONS = {
     "rotation": (
         "no_reply corrupt_replies wrong_device alert_voltage alert_hall_sensor alert_overheating alert_encoder "
         "alert_electrical_shock alert_overload watchdog_tripped ram_reset turns_lost torque_off not_moving "
-        "moving_uncommanded wrong_way voltage_near_limit temperature_near_limit unplugged"
+        "not_arriving overspeed moving_uncommanded wrong_way voltage_near_limit temperature_near_limit unplugged"
     ),
     "servo_bus": "adapter_latency",
     "actuator": (
         "no_feedback implausible_feedback feedback_flood overload parameter saturation backdrive fatal voltage "
-        "temperature uncommanded_motion not_moving restarted wrong_address thermal_derating thermal_limit sides_apart"
+        "temperature uncommanded_motion not_moving not_arriving overspeed restarted wrong_address thermal_derating "
+        "thermal_limit sides_apart"
     ),
     "can": (
-        "interface_down bus_off error_passive unplugged queue_overrun address_conflict cannot_claim claim_storm flood"
+        "interface_down bus_off error_passive unplugged adapter_refuses queue_overrun address_conflict cannot_claim "
+        "claim_storm flood"
     ),
     "camera": (
         "missing stale black blown_out blocked frozen blurred torn wrong_resolution knocked depth_missing "
@@ -114,6 +116,7 @@ def test_the_dangerous_ones_stop_and_the_lost_ones_disarm() -> None:
     assert {key for key in stops if not key.startswith("stop_input.")} == {
         "rotation.moving_uncommanded",
         "rotation.wrong_way",
+        "rotation.overspeed",
     }
     for key in (
         "rotation.no_reply",

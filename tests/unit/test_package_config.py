@@ -12,6 +12,7 @@ import pytest
 from graderd.config import Config, ConfigError, load, parse
 from graderd.config.migrate import CURRENT_VERSION, Document, migrate_file, migrate_text, rename
 from graderd.core.axes import ACTUATORS
+from graderd.hal.settings import ElectrakSettings, Ph54Settings
 
 PROJECT = Path(__file__).resolve().parents[2]
 
@@ -49,7 +50,9 @@ def test_migration_keeps_values_and_comments_and_leaves_a_backup(tmp_path: Path)
     assert path.stat().st_mode & 0o777 == 0o660
     config = load(path)
     assert config.version == CURRENT_VERSION
+    assert isinstance(config.rotation, Ph54Settings)
     assert config.rotation.zero_deg == 12.5
+    assert isinstance(config.lift_left, ElectrakSettings)
     assert config.lift_left.address_n == 21
 
 

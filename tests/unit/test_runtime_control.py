@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,34 @@ async def test_stop_holds_every_axis_before_it_returns_and_latches(bench: Bench,
     assert last.reason == "test (by t)"
 
 
+async def test_an_ordinary_restart_keeps_the_last_stop(bench: Bench, tmp_path: Path) -> None:
+    bench.loop.stop_now(cmd.Stop(reason="dog on the site", client="cab"))
+    assert (await bench.do(cmd.Reset(client="cab", stop_n=1))).accepted
+    assert bench.loop.end("SIGTERM received") is False
+    assert bench.loop.tick.state.mode is Mode.STOPPED
+    last = StateFile(str(tmp_path)).load()
+    assert last is not None
+    assert last.reason == "dog on the site (by cab)"
+    assert Bench(tmp_path).loop.last_stop == last
+
+
+async def test_an_end_that_interrupts_work_is_the_last_stop(bench: Bench, tmp_path: Path) -> None:
+    await bench.arm()
+    assert bench.loop.end("SIGTERM received") is True
+    last = StateFile(str(tmp_path)).load()
+    assert last is not None
+    assert last.reason == "SIGTERM received"
+
+
+async def test_a_change_of_mode_says_who_and_why_in_fields(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, logger="graderd"):
+        bench.loop.stop_now(cmd.Stop(reason="forged\n2026 INFO stopped -> auto\x1b[2J", client="\x9bcab"))
+    (record,) = [record for record in caplog.records if "stopped" in record.getMessage()]
+    assert record.__dict__["mode"] == "stopped"
+    assert record.__dict__["client"] == "\\x9bcab"
+    assert record.getMessage() == "disarmed -> stopped: forged\\n2026 INFO stopped -> auto\\x1b[2J (by \\x9bcab)"
+
+
 async def test_one_driver_that_fails_to_hold_does_not_keep_the_others_from_it(bench: Bench) -> None:
     await bench.arm()
     bench.machine.rotation.hold_raises = True
@@ -169,7 +198,8 @@ async def test_a_stale_axis_holds_and_the_others_go_on(bench: Bench) -> None:
 
 async def test_arming_is_refused_with_the_list_of_what_is_unmet(bench: Bench) -> None:
     bench.machine.tilt.lifecycle = Lifecycle.FAILED
-    bench.machine.rotation.position = 75.0
+    bench.machine.clock.advance(1.0)
+    bench.machine.rotation.position = 75.0  # turned by hand while nobody looked
     reply = await bench.do(cmd.Arm(client="t"))
     assert not reply.accepted
     assert "tilt: failed" in reply.message
@@ -243,3 +273,75 @@ async def test_a_flood_of_commands_is_worked_off_in_portions(bench: Bench) -> No
     assert sum(task.done() for task in tasks) == 32
     await bench.ticks(3)
     assert all(task.done() for task in tasks)
+
+
+async def moving(bench: Bench, speeds: dict[str, float], until_mode: Mode, most_n: int = 100) -> dict[str, float]:
+    """Push axes along until the mode is reached; how far each went."""
+    axes = {name: bench.machine.devices.all()[name] for name in speeds}
+    start = {name: axis.position for name, axis in axes.items()}  # type: ignore[union-attr]
+    for _ in range(most_n):
+        for name, axis in axes.items():
+            axis.position += speeds[name] * TICK_S  # type: ignore[union-attr]
+        await bench.ticks()
+        if bench.loop.tick.state.mode is until_mode:
+            return {name: abs(axis.position - start[name]) for name, axis in axes.items()}  # type: ignore[union-attr]
+    raise AssertionError(f"still {bench.loop.tick.state.mode}: {bench.loop.tick.faults}")
+
+
+@pytest.mark.parametrize("speed_deg_per_s", [0.4, 30.0])
+async def test_a_blade_that_turns_uncommanded_stops_the_machine(bench: Bench, speed_deg_per_s: float) -> None:
+    await bench.arm()
+    await bench.ticks(100)
+    went = await moving(bench, {"rotation": speed_deg_per_s}, Mode.STOPPED)
+    assert went["rotation"] <= 0.5 + 2 * TICK_S * speed_deg_per_s
+    assert bench.machine.rotation.held_n > 0
+    assert "rotation.moving_uncommanded" in bench.loop.tick.state.reason
+
+
+async def test_an_actuator_that_moves_uncommanded_is_disarmed_in_the_tick_that_reads_it(bench: Bench) -> None:
+    await bench.arm()
+    await bench.ticks(100)
+    went = await moving(bench, {"tilt": -20.0}, Mode.DISARMED)
+    assert went["tilt"] <= 2.0 + 20.0 * TICK_S
+    assert bench.loop.tick.faults[0].name == "tilt.uncommanded_motion"
+    await bench.ticks(2)
+    assert bench.machine.tilt.lifecycle is Lifecycle.STANDBY
+    await bench.ticks(60)
+    (fault,) = bench.loop.tick.faults
+    assert not fault.present, "over; the catalogue's latch keeps it until armed again"
+    await bench.arm()
+    assert bench.loop.tick.faults == ()
+
+
+async def test_a_stuck_blade_holds_until_armed_again(bench: Bench) -> None:
+    await bench.arm()
+    bench.machine.rotation.stuck = True
+    await bench.do(cmd.Auto(client="t"))
+    await bench.ticks(150, Zone.LEFT, share_left=0.9, share_center=0.1)
+    (fault,) = bench.loop.tick.faults
+    assert fault.name == "rotation.not_moving"
+    assert "no movement for 0.7" in fault.detail
+    bench.machine.log.clear()
+    bench.machine.rotation.stuck = False
+    await bench.ticks(150, Zone.LEFT, share_left=0.9, share_center=0.1)
+    assert not any("rotation goal" in line for line in bench.machine.log)
+
+
+async def test_a_stuck_lift_is_disarmed(bench: Bench) -> None:
+    await bench.arm()
+    bench.machine.lift_left.stuck = bench.machine.lift_right.stuck = True
+    await bench.do(cmd.Jog(axis="lift", value=150.0, relative=False, client="t"))
+    for _ in range(12):
+        await bench.ticks(4)
+        await bench.do(cmd.Renew(client="t"))
+    assert bench.loop.tick.state.mode is Mode.DISARMED
+    assert "not_moving" in bench.loop.tick.state.reason
+
+
+async def test_a_late_tick_is_told_for_a_second_and_a_long_one_beside_it(bench: Bench) -> None:
+    for late_s in (0.7, 0.15):
+        bench.loop.turn(late_s)
+    await bench.ticks(2)
+    assert {f.name for f in bench.loop.tick.faults} == {"daemon.loop_blocked", "daemon.tick_overrun"}
+    await bench.ticks(50)
+    assert bench.loop.tick.faults == ()

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from graderd.config import Config
+from graderd.hal.settings import Ph54Settings
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "integrators" / "safety.md").read_text("utf-8")
@@ -46,5 +47,6 @@ def test_every_function_is_named_by_a_hazard_and_has_a_proof() -> None:
 
 def test_braking_is_what_the_settings_give() -> None:
     config = Config()
+    assert isinstance(config.rotation, Ph54Settings)
     speed, braking = config.rotation.speed_deg_per_s, config.rotation.profile_acceleration_deg_per_s2
     assert f"{speed / braking:.2f} s and {speed**2 / braking / 2:.1f}° from" in PAGE

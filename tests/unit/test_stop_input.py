@@ -6,7 +6,7 @@ import asyncio
 import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -19,14 +19,16 @@ from pydantic import ValidationError
 from graderd.config import Config
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import Clear, Reaction
-from graderd.drivers.stop_input import GpioStopInput, SerialStopInput, SimulatedStopInput, make_stop_input
+from graderd.drivers.simulated.stop_input import SimulatedStopInput
+from graderd.drivers.stop_input import GpioStopInput, SerialStopInput
 from graderd.hal.clock import ManualClock, SystemClock
 from graderd.hal.errors import DeviceLostError, DeviceMissingError
 from graderd.hal.settings import StopInputSettings
 from graderd.hal.stop_input import StopInput
 from graderd.runtime.stop_input import FIRST_WORD_S, StopInputWatch
 from graderd.simulator.stop_loop import StopLoop
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
+from tests.contract.conformance import StopInputConformance, StopInputStand
 
 DEADLINE_S = 5.0
 
@@ -113,8 +115,7 @@ def test_a_pulled_adapter_is_lost_and_the_port_let_go() -> None:
 
 
 def test_a_port_that_is_not_there_or_has_no_lines_is_missing(tmp_path: Path) -> None:
-    missing = make_stop_input(StopInputSettings(backend="serial", port=str(tmp_path / "none")))
-    assert missing is not None
+    missing = SerialStopInput(StopInputSettings(backend="serial", port=str(tmp_path / "none")))
     with pytest.raises(DeviceMissingError, match="Check its cable"):
         missing.open()
     # A pseudo-terminal opens, and has no modem lines: the ioctl fails.
@@ -124,8 +125,7 @@ def test_a_port_that_is_not_there_or_has_no_lines_is_missing(tmp_path: Path) -> 
     import os
 
     try:
-        without = make_stop_input(StopInputSettings(backend="serial", port=os.ttyname(slave)))
-        assert without is not None
+        without = SerialStopInput(StopInputSettings(backend="serial", port=os.ttyname(slave)))
         with pytest.raises(DeviceMissingError):
             without.open()
     finally:
@@ -219,8 +219,7 @@ def test_a_gpio_chip_that_is_not_there_is_missing(tmp_path: Path) -> None:
     no_chip = tmp_path / "file"
     no_chip.write_text("", encoding="utf-8")
     for path in (tmp_path / "none", no_chip, Path("/dev/null")):
-        source = make_stop_input(StopInputSettings(backend="gpio", port=str(path)))
-        assert isinstance(source, GpioStopInput)
+        source = GpioStopInput(StopInputSettings(backend="gpio", port=str(path)))
         with pytest.raises(DeviceMissingError, match="cannot be used as stop input"):
             source.open()
 
@@ -232,7 +231,6 @@ def test_without_its_package_the_gpio_backend_says_how_to_get_it(monkeypatch: py
 
 
 def test_settings() -> None:
-    assert make_stop_input(StopInputSettings()) is None
     assert Config().stop_input.backend == "none"
     with pytest.raises(ValidationError, match="needs a port"):
         StopInputSettings(backend="serial")
@@ -240,7 +238,6 @@ def test_settings() -> None:
         StopInputSettings(backend="gpio")
     with pytest.raises(ValidationError, match="two lines"):
         StopInputSettings(backend="gpio", port="/dev/gpiochip0", gpio_drive_n=4, gpio_sense_n=4)
-    assert isinstance(make_stop_input(StopInputSettings(backend="simulated", port="x")), SimulatedStopInput)
 
 
 @pytest.mark.parametrize("condition", ["open", "lost", "stale", "stuck"])
@@ -383,3 +380,62 @@ def test_a_frozen_process_does_not_take_its_own_silence_for_the_loops(tmp_path: 
     after_s = thawed_s + 2.0 / settings.poll_hz
     assert watch.faults(after_s - 1e-6) == ()
     assert [fault.condition for fault in watch.faults(after_s)] == ["stale"]
+
+
+class WiredStand(StopInputStand):
+    """A driver on a fake port or chip."""
+
+    def __init__(self, source: StopInput, wire: FakePort | FakeGpio) -> None:
+        self.source = source
+        self._wire = wire
+
+    def become(self, loop: str) -> None:
+        self._wire.pressed, self._wire.shorted, self._wire.gone = loop == "open", loop == "shorted", loop == "gone"
+
+
+class TestSerial(StopInputConformance):
+    @pytest.fixture
+    def stop_stand(self) -> WiredStand:
+        port = FakePort()
+        return WiredStand(serial_input(port), port)
+
+
+class TestGpio(StopInputConformance):
+    @pytest.fixture
+    def stop_stand(self, gpio: FakeGpio) -> WiredStand:
+        return WiredStand(gpio_input(), gpio)
+
+
+class SimulatedStand(StopInputStand):
+    """The simulator's loop, served from a thread, because the driver's calls block."""
+
+    def __init__(self, path: Path) -> None:
+        self.source = SimulatedStopInput(str(path))
+        self._events = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._events.run_forever, name="stop-loop")
+        self._thread.start()
+        self._loop = StopLoop(path)
+        self.become("closed")
+
+    def become(self, loop: str) -> None:
+        asyncio.run_coroutine_threadsafe(self._loop.become(loop), self._events).result(DEADLINE_S)  # type: ignore[arg-type]
+
+    def end(self) -> None:
+        self.source.close()
+        self.become("gone")
+
+        async def rest() -> None:
+            await asyncio.gather(*(asyncio.all_tasks() - {asyncio.current_task()}), return_exceptions=True)
+
+        asyncio.run_coroutine_threadsafe(rest(), self._events).result(DEADLINE_S)
+        self._events.call_soon_threadsafe(self._events.stop)
+        self._thread.join()
+        self._events.close()
+
+
+class TestSimulated(StopInputConformance):
+    @pytest.fixture
+    def stop_stand(self, tmp_path: Path) -> Iterator[SimulatedStand]:
+        made = SimulatedStand(tmp_path / "stop.sock")
+        yield made
+        made.end()

@@ -14,9 +14,9 @@ from graderd.drivers.dynamixel.device import Ph54Device
 from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.errors import DeviceError, DeviceTimeoutError, LifecycleError
 from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.settings import RotatorSettings
+from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 from tests.dynamixel_sim import bench, until
 
 TABLE = ControlTable.load("ph54_200_s500")
@@ -48,7 +48,7 @@ async def tapped(tmp_path: Path, servo: VirtualServo, **changes: float) -> tuple
     wire = VirtualServoBus([servo], tmp_path / "servo", clock=clock)
     await wire.start()
     tap = Tap()
-    rotator = Ph54Rotator(RotatorSettings(**{"port": str(tmp_path / "servo"), **changes}), clock=clock, bus_log=tap)
+    rotator = Ph54Rotator(Ph54Settings(**{"port": str(tmp_path / "servo"), **changes}), clock=clock, bus_log=tap)
     await rotator.open()
     return tap, rotator, wire
 

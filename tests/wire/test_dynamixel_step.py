@@ -23,6 +23,7 @@ async def test_the_manoeuvre_measures_the_virtual_blade(tmp_path: Path) -> None:
         assert up.settling_s is not None
         assert up.settling_s < 0.6
         assert up.overshoot_deg < 0.5
+        assert up.peak_current_a is not None
         assert up.peak_current_a > 0.3
         assert all(abs(s.error_deg) < 0.2 for s in recording.steps)
         assert recording.backlash_from == "reference"

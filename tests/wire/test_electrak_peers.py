@@ -23,7 +23,7 @@ from graderd.drivers.electrak import CanLink, ElectrakActuator, safe_off
 from graderd.drivers.j1939.ids import Pgn
 from graderd.drivers.j1939.transport import Message
 from graderd.hal.errors import DeviceMissingError
-from graderd.hal.settings import ActuatorSettings, CanSettings
+from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from tests.electrak_sim import until
 
@@ -77,7 +77,7 @@ async def test_our_driver_drives_an_actuator_and_cantools_reads_what_we_send(
     heard: list[dict[str, Any]] = []
     machine.listen(lambda f: heard.append(database.decode_message("ACM", f.data)) if f.can_id == 0x18EF13E7 else None)
     link = CanLink(CanSettings(interface="slcan", channel=str(tmp_path / "can")))
-    axis = ElectrakActuator("lift_left", ActuatorSettings(), link)
+    axis = ElectrakActuator("lift_left", ElectrakSettings(), link)
     await axis.open()
     await axis.arm()
     for _ in range(25):
@@ -179,10 +179,10 @@ async def test_the_virtual_actuators_run_alone_and_take_faults_on_standard_input
         assert process.stdin is not None
         assert (await read_line(process.stdout))["event"] == "ready"
         link = CanLink(CanSettings(interface="slcan", channel=str(tmp_path / "can")))
-        tilt = ActuatorSettings(address_n=27, profile="electrak_md_a050", max_mm=95.0, current_limit_a=5.0)
+        tilt = ElectrakSettings(address_n=27, profile="electrak_md_a050", max_mm=95.0, current_limit_a=5.0)
         axes = [
-            ElectrakActuator("lift_left", ActuatorSettings(address_n=19), link),
-            ElectrakActuator("lift_right", ActuatorSettings(address_n=20), link),
+            ElectrakActuator("lift_left", ElectrakSettings(address_n=19), link),
+            ElectrakActuator("lift_right", ElectrakSettings(address_n=20), link),
             ElectrakActuator("tilt", tilt, link),
         ]
         await asyncio.gather(*(axis.open() for axis in axes))

@@ -114,6 +114,23 @@ ROWS = (
         axes=OWN,
     ),
     FaultRow(
+        "actuator.not_arriving",
+        "an actuator moves and hardly comes nearer to where it is told to go",
+        "a load that it barely overcomes, or a low supply voltage",
+        "take some load off the blade, measure the voltage at the actuator while it moves; then disarm and arm",
+        Reaction.HOLD,
+        clear=Clear.ON_REARM,
+        axes=OWN,
+    ),
+    FaultRow(
+        "actuator.overspeed",
+        "an actuator moves much faster than it may",
+        "its load drives it, its screw or brake is broken, or the load fell off",
+        "keep away from the blade; have screw and brake checked; then arm",
+        Reaction.DISARM,
+        clear=Clear.ON_REARM,
+    ),
+    FaultRow(
         "actuator.restarted",
         "an actuator has restarted",
         "its power was cut for a moment",

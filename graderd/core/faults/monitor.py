@@ -82,14 +82,11 @@ def update_faults(
 ) -> FaultState:
     """Debounce what is present, keep what is latched, drop what cleared by itself.
 
-    What a driver keeps latched after its cause is gone does not count as present: the row's own latch decides.
     An unknown condition is never ignored: it counts as a STOP until reset, because nobody decided what it means.
     """
     seen: dict[str, float] = {}
     active: dict[str, ActiveFault] = {}
     for fault in present:
-        if fault.latched:
-            continue
         row = row_for(fault, catalogue)
         first_s = min(state.first_seen_s.get(fault.name, now_s), now_s)
         seen[fault.name] = first_s

@@ -123,6 +123,23 @@ ROWS = (
         axes=ROTATION,
     ),
     FaultRow(
+        "rotation.not_arriving",
+        "the blade moves and hardly comes nearer to where it is told to go",
+        "a load that the servo barely overcomes, a low supply voltage, or settings that let it swing about its goal",
+        "take some load off the blade, look at supply and current limit; then disarm and arm",
+        Reaction.HOLD,
+        clear=Clear.ON_REARM,
+        axes=ROTATION,
+    ),
+    FaultRow(
+        "rotation.overspeed",
+        "the blade turns much faster than it may",
+        "a jam that came free under load, an overwhelming outer force, or wrong limits in the servo",
+        "keep away, use the emergency stop; find the cause before reset and arm",
+        Reaction.STOP,
+        clear=Clear.ON_RESET,
+    ),
+    FaultRow(
         "rotation.moving_uncommanded",
         "the blade turns although nobody told it to",
         "an overwhelming outer force, a broken coupling, a faulty servo, or another program on its bus",

@@ -6,6 +6,10 @@ The functions import what they need when called, so that ``graderd --help`` and 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from graderd.config import Config
 
 
 def run_daemon(config_path: Path | None, sim: bool, rig_dir: Path | None, as_json: bool) -> int:
@@ -20,3 +24,10 @@ def run_guard(config_path: Path | None) -> int:
     from graderd.runtime.app.guard import run_guard as run
 
     return run(config_path)
+
+
+def problems(config: Config) -> list[str]:
+    """See :func:`graderd.runtime.app.check.problems`."""
+    from graderd.runtime.app.check import problems as find
+
+    return find(config)

@@ -1,46 +1,77 @@
-"""Builds the devices from the configuration. Here, and in this package only, drivers are imported."""
+"""Builds the devices that the configuration names."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 from graderd.config import Config
-from graderd.drivers.dynamixel.ph54 import Ph54Rotator
-from graderd.drivers.electrak.actuator import ElectrakActuator
-from graderd.drivers.electrak.dump import candump_line
+from graderd.drivers.backend import Parts
+from graderd.drivers.j1939.bus_health import BusEvent
+from graderd.drivers.j1939.can_logs import candump_line
+from graderd.drivers.j1939.ids import Frame
 from graderd.drivers.j1939.link import CanLink
-from graderd.drivers.stop_input import make_stop_input
 from graderd.hal.clock import Clock
 from graderd.hal.fault import DeviceFault
 from graderd.hal.linear_actuator import LinearActuator
+from graderd.hal.service import DeviceService
+from graderd.runtime.app.backends import actuator_of, rotator_of, stop_input_of
 from graderd.runtime.devices import Devices
 from graderd.runtime.stop_input import StopInputWatch
 
 
 def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], None]) -> Devices:
-    """All devices, closed. ``on_bus_stop`` is called for a stop message on the CAN bus."""
-    rotator = Ph54Rotator(config.rotation, clock)
+    """All devices, closed. ``on_bus_stop`` is called for a stop message on the CAN bus.
+
+    Raises:
+        ConfigError: a driver from elsewhere cannot be had, or does not take its settings.
+    """
     link = CanLink(config.can, clock, on_stop=on_bus_stop)
-    actuators: dict[str, LinearActuator] = {
-        name: ElectrakActuator(name, section, link, clock) for name, section in config.actuators().items()
-    }
+    parts = Parts(clock, link)
+    services: dict[str, DeviceService] = {}
+
+    backend, settings = rotator_of(config.rotation)
+    rotator = backend.build(settings, parts)
+    services.update({f"rotation.{name}": service for name, service in backend.services(rotator).items()})
+
+    actuators: dict[str, LinearActuator] = {}
+    for axis, section in config.actuators().items():
+        of_axis, its_settings = actuator_of(axis, section)
+        actuators[axis] = of_axis.build(axis, its_settings, parts)
+        services.update({f"{axis}.{name}": service for name, service in of_axis.services(actuators[axis]).items()})
 
     def publish(faults: tuple[DeviceFault, ...], stopped: bool) -> None:
         link.publish_faults(faults, stopped=stopped)
 
     def watch_bus(listener: Callable[[str], None]) -> Callable[[], None]:
-        return link.tap(lambda frame, now_s: listener(candump_line(frame, now_s)))
+        def write(item: Frame | BusEvent, now_s: float) -> None:
+            listener(candump_line(item, now_s))
+
+        end_frames, end_events = link.tap(write), link.tap_events(write)
+
+        def end() -> None:
+            end_frames()
+            end_events()
+
+        return end
 
     return Devices(
         rotation=rotator,
         link=link,
         actuators=actuators,
+        services=services,
         publish_faults=publish,
         watch_bus=watch_bus,
     )
 
 
 def build_stop_input(config: Config, clock: Clock, on_stop: Callable[[str], None]) -> StopInputWatch | None:
-    """The watch over the stop input, or None where the configuration names none."""
-    source = make_stop_input(config.stop_input)
-    return None if source is None else StopInputWatch(config.stop_input, source, clock, on_stop)
+    """The watch over the stop input, or None where the configuration names none.
+
+    Raises:
+        ConfigError: as :func:`build_devices`.
+    """
+    named = stop_input_of(config.stop_input)
+    if named is None:
+        return None
+    backend, settings = named
+    return StopInputWatch(settings, backend.build(settings), clock, on_stop)

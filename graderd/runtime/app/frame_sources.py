@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 
+from graderd.drivers.simulated.camera import RigCamera
 from graderd.hal.camera import Camera
 from graderd.hal.errors import DeviceMissingError, ProtocolError
-from graderd.hal.settings import CameraSettings
+from graderd.hal.settings import CameraSettings, is_plugin
 from graderd.perception.frame_set import FrameSetCamera, is_frame_set
 
 
@@ -18,15 +18,19 @@ def open_camera(settings: CameraSettings, real_time: bool = True) -> Camera:
 
     Raises:
         DeviceMissingError: the source needs a path and has none, or its driver cannot be loaded.
+        ConfigError: a driver from elsewhere cannot be had, or does not take its settings.
     """
+    if is_plugin(settings.source):
+        from graderd.runtime.app.backends import plugin_camera_of  # loaded late: it brings all other drivers with it
+
+        backend, own = plugin_camera_of(settings)
+        return backend.build(own, real_time)
     if settings.source != "realsense" and not settings.path:
         raise DeviceMissingError("camera", f"source {settings.source!r} needs a path", "Set camera.path")
     if settings.source == "frame_set":
         return FrameSetCamera(settings, real_time)
     if settings.source == "rig":
-        # Only the simulated grader has this module's renderer; nothing else of the daemon loads it.
-        rig: Camera = importlib.import_module("graderd.drivers.simulated.camera").RigCamera(settings)
-        return rig
+        return RigCamera(settings)
     from graderd.drivers import realsense  # loaded late: a daemon on the rig needs no camera library
 
     if settings.source == "realsense":

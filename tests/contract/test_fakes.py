@@ -1,0 +1,97 @@
+"""The fakes that tests of the runtime drive obey the same contracts as the devices they stand for; so do the clocks."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from graderd.hal.clock import Clock, ManualClock, SystemClock
+from harness.awake_clock import AwakeClock
+from tests.contract.conformance import (
+    ActuatorStand,
+    ClockConformance,
+    LinearActuatorConformance,
+    RotatorConformance,
+    RotatorStand,
+)
+from tests.fakes import FakeActuator, FakeRotator
+
+
+class FakeRotatorStand(RotatorStand):
+    """A fake without dynamics, on a clock that moves when told."""
+
+    low, high, reached, still = -FakeRotator.LIMIT, FakeRotator.LIMIT, 0.5, 0.01
+    instant = True
+
+    def __init__(self) -> None:
+        self.clock: ManualClock = ManualClock(1000.0)
+        self.fake = FakeRotator("rotation", self.clock, -100.0, [])
+
+    @property
+    def device(self) -> FakeRotator:
+        return self.fake
+
+    def true_position(self) -> float:
+        return self.fake.position
+
+    async def lose_wire(self) -> None:
+        self.fake.lose()
+
+    async def restore_wire(self) -> None:
+        self.fake.restore()
+
+    async def wait(self, seconds: float) -> None:
+        self.clock.advance(seconds)
+        await asyncio.sleep(0)
+
+
+class FakeActuatorStand(ActuatorStand):
+    """The same for an actuator."""
+
+    low, high, reached, still = -FakeActuator.LIMIT, FakeActuator.LIMIT, 0.5, 0.01
+    instant = True
+
+    def __init__(self) -> None:
+        self.clock: ManualClock = ManualClock(1000.0)
+        self.fake = FakeActuator("tilt", self.clock, -100.0, [])
+
+    @property
+    def device(self) -> FakeActuator:
+        return self.fake
+
+    def true_position(self) -> float:
+        return self.fake.position
+
+    async def lose_wire(self) -> None:
+        self.fake.lose()
+
+    async def restore_wire(self) -> None:
+        self.fake.restore()
+
+    async def wait(self, seconds: float) -> None:
+        self.clock.advance(seconds)
+        await asyncio.sleep(0)
+
+
+class TestFakeRotator(RotatorConformance):
+    @pytest.fixture
+    async def stand(self) -> FakeRotatorStand:
+        made = FakeRotatorStand()
+        await made.fake.close()
+        return made
+
+
+class TestFakeActuator(LinearActuatorConformance):
+    @pytest.fixture
+    async def stand(self) -> FakeActuatorStand:
+        made = FakeActuatorStand()
+        await made.fake.close()
+        return made
+
+
+@pytest.mark.parametrize("made", [SystemClock, ManualClock, AwakeClock])
+class TestClocks(ClockConformance):
+    @pytest.fixture
+    def clock(self, made: type[Clock]) -> Clock:
+        return made()

@@ -1,0 +1,41 @@
+"""The page on the house says where to look: what it names is there, and the walks stay short enough to be walked."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).parents[2]
+PAGE = (PROJECT / "docs" / "developers" / "architecture.md").read_text(encoding="utf-8")
+WALKS = {
+    title: re.findall(r"`([\w/]+\.py)`", text)
+    for title, text in re.findall(r"^\*\*([^*]+)\*\* — (.+?)(?=\n\n)", PAGE, re.MULTILINE | re.DOTALL)
+}
+LONGEST_N = {
+    "A frame becomes goal bytes": 20,
+    "A jog reaches the CAN bus": 22,
+    "A fault becomes text": 11,
+    "A key of the configuration comes to use": 11,
+    "A stop reaches the wires": 13,
+}
+
+
+@pytest.mark.parametrize("title", LONGEST_N)
+def test_a_walk_leads_over_files_that_are_there_and_is_short(title: str) -> None:
+    files = WALKS[title]
+    assert len(files) == len(set(files)) <= LONGEST_N[title]
+    assert [name for name in files if not (PROJECT / name).is_file()] == []
+
+
+def test_no_walk_without_a_bound() -> None:
+    assert set(WALKS) == set(LONGEST_N)
+
+
+def test_rooms_of_the_page_are_folders() -> None:
+    listing = PAGE.partition("```")[2].partition("```")[0]
+    for room in re.findall(r"^(\w+)/", listing, re.MULTILINE):
+        assert (PROJECT / room).is_dir(), room
+    for room in re.findall(r"^  (\w+)/", listing, re.MULTILINE):
+        assert (PROJECT / "graderd" / room).is_dir() or (PROJECT / "drivers" / room).is_dir(), room
