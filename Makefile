@@ -20,7 +20,7 @@ PYTHON_TARGETS ?= run test
 FIND_PYTHON = PYENV_VERSION=$* $(BIN)/uv python find --system --no-python-downloads
 SOAK_S ?= 900
 
-.PHONY: help run test quick test-pythons faults deb hil soak soak-virtual-time hil-package hil-arm64 hil-usb bench-hw check format lock clean
+.PHONY: help run test quick test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
@@ -118,6 +118,10 @@ hil-usb: $(STAMP) ## QEMU: an FTDI adapter pulled and plugged, two SJA1000 contr
 
 bench-hw: $(STAMP) ## tests against real hardware; asks before each motion (needs GRADERD_BENCH=1 and a terminal)
 	@PYTHONPATH=. $(BIN)/python -m hil.bench $(BENCH_ARGS)
+
+monitor: $(STAMP) ## a million random ticks, and a thousand moves of the lifts of each kind, judged from outside (half an hour)
+	@GRADERD_MONITOR_TICKS=1000000 $(BIN)/python -m pytest -q tests/unit/test_core_tick_monitor.py
+	@$(BIN)/python -m benchmarks.lift_pair
 
 mutants: $(STAMP) ## mutate gate, state machine and fault monitor; list what the tests let live
 	@$(BIN)/python -m mutmut run $(ARGS)

@@ -73,8 +73,8 @@ class RotatorSettings(Settings):
     """Blade rotation, whatever turns it."""
 
     backend: Annotated[str, _one_of("ph54")] = Field("ph54", description="driver: ph54, or package.module:NAME")
-    min_deg: Finite = Field(-60.0, ge=-180, le=180, description="limit at the blade, for gate and servo alike")
-    max_deg: Finite = Field(60.0, ge=-180, le=180, description="limit at the blade, for gate and servo alike")
+    min_deg: Finite = Field(-60.0, ge=-180, le=180, description="limit at the blade, for gate and driver alike")
+    max_deg: Finite = Field(60.0, ge=-180, le=180, description="limit at the blade, for gate and driver alike")
     window_deg: Positive = Field(
         120.0, le=360, description="largest distance from where the blade stood when it was armed; 360: no window"
     )
@@ -247,8 +247,8 @@ class ElectrakSettings(ActuatorSettings):
 class PluginActuatorSettings(ActuatorSettings):
     """One linear actuator by a driver from elsewhere; its stroke is not graderd's to guess."""
 
-    min_mm: NotNegative = Field(description="limit of extension, for gate and driver alike")
-    max_mm: Positive = Field(description="limit of extension, for gate and driver alike")
+    min_mm: NotNegative = Field(le=1000, description="limit of extension, for gate and driver alike")
+    max_mm: Positive = Field(le=1000, description="limit of extension, for gate and driver alike")
     driver: DriverTable
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from graderd.config import Config
 from graderd.core.axes import AXES, LIFTS, Goals, Pose
-from graderd.core.gate import STANDING_S, GateInputs, GateSettings, GateState, Setpoint, pass_gate
+from graderd.core.gate import LONGEST_STEP_S, STANDING_S, GateInputs, GateSettings, GateState, Setpoint, pass_gate
 from graderd.core.machine import ARMED, Mode
 from graderd.hal.settings import ElectrakSettings, Ph54Settings
 
@@ -244,6 +244,27 @@ def test_after_a_hold_it_starts_again_from_the_measured_position_at_rest() -> No
     state, passed = pass_gate(state, goal("rotation", 40.0), inputs(pose=pushed))
     limits = FIGURES["rotation"]
     assert passed["rotation"].limited == pytest.approx(-3.0 + limits.acceleration * DT_S * DT_S)
+
+
+def test_what_is_pushed_while_it_is_held_starts_from_where_it_is_now() -> None:
+    """Not from where it was in the tick before: that would be a leap in the very first tick."""
+    state, _ = pass_gate(GateState(), Goals(), inputs())
+    pushed = replace(POSE, rotation_deg=-30.0)
+    _, passed = pass_gate(state, goal("rotation", 40.0), inputs(pose=pushed))
+    limits = FIGURES["rotation"]
+    assert passed["rotation"].limited == pytest.approx(-30.0 + limits.acceleration * DT_S * DT_S)
+
+
+@pytest.mark.parametrize("axis", PACED)
+def test_a_late_tick_is_not_made_up_for(axis: str) -> None:
+    """Drivers have held meanwhile: the goal goes on from there as if the tick had not been so late."""
+    limits = FIGURES[axis]
+    state = GateState({axis: Setpoint(getattr(POSE, FIELDS[axis]), limits.speed, getattr(POSE, FIELDS[axis]))})
+    for late_s in (0.11, 0.4, 3.0, 1e6):
+        _, passed = pass_gate(state, goal(axis, limits.high), inputs(dt_s=late_s))
+        limited = passed[axis].limited
+        assert limited is not None
+        assert limited - getattr(POSE, FIELDS[axis]) <= LONGEST_STEP_S * limits.speed + 1e-9
 
 
 def test_a_measurement_lost_in_motion_holds_and_keeps_the_armed_pose() -> None:

@@ -66,6 +66,7 @@ def standing(
     }
 
 
+FASTEST = {"rotation": 25.0, "lift_left": 20.0, "lift_right": 20.0, "tilt": 15.0}
 HOME = {"rotation": 0.0, "lift_left": 100.0, "lift_right": 100.0, "tilt": 50.0}
 
 
