@@ -105,7 +105,8 @@ def stretch_of_work() -> list[Sensed]:
             for axis, decided in tick.axes.items()
             if decided.send is not None or (axis in goals and not decided.hold)
         }
-        at |= goals
+        for axis, goal in goals.items():
+            at[axis] += max(-FASTEST[axis] * TICK_S, min(goal - at[axis], FASTEST[axis] * TICK_S))
         found.append(sensed)
     return found
 
