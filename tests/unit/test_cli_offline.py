@@ -135,6 +135,7 @@ def test_config_show_prints_a_file_that_is_valid_again(tmp_path: Path, capsys: C
         (["rig", "dataset", "--help"], "graderd.simulator.dataset", ["--help"]),
         (["rig", "dataset", "--", "--help"], "graderd.simulator.dataset", ["--help"]),
         (["can", "dump", "can0", "--json"], "graderd.drivers.electrak.dump", ["can0", "--json"]),
+        (["can", "database", "--kcd"], "graderd.runtime.app.can_database", ["--kcd"]),
         (["can", "dump", "--", "--help"], "graderd.drivers.electrak.dump", ["--help"]),
         (["demo", "--json"], "graderd.simulator.demo", ["--json"]),
     ],
