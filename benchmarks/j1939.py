@@ -1,10 +1,10 @@
-"""graderd's J1939 beside cantools and python-can-j1939: codec, whole receive and send path, and steadiness of the schedule.
+"""graderd's J1939 beside cantools and python-can-j1939: codec, receive and send path, steadiness of the schedule.
 
 ``python benchmarks/j1939.py [--seconds N] [--json]``. The three are measured in one run on one machine; the period
-measurement runs graderd and python-can-j1939 at the same time, each in a process and on an slcan adapter of its own, with the
-same 800 frames a second coming in (run it on a machine that is otherwise quiet: the tail of the period error is the
-machine's where its cores are taken). Exit status 1 where a
-bar is missed: ahead of python-can-j1939 everywhere, and no more than a fifth behind bare cantools as a codec.
+measurement runs graderd and python-can-j1939 at the same time, each in a process and on an slcan adapter of its own,
+with the same 800 frames a second coming in (run it on a machine that is otherwise quiet: the tail of the period error
+is the machine's where its cores are taken). Exit status 1 where a bar is missed: ahead of python-can-j1939 everywhere,
+and no more than a fifth behind bare cantools as a codec.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Axis:
 
 
 def measure_codec(seconds: float) -> dict[str, dict[str, Measured]]:
-    """Eight bytes to values and back: ours, cantools, and python-can-j1939 with cantools (it has no codec of its own)."""
+    """Eight bytes to values and back: ours, cantools, and python-can-j1939 with cantools (it has no codec)."""
     codec, database = ElectrakCodec("electrak_hd"), load_database("electrak_hd")
     afm, acm = database.get_message_by_name("AFM"), database.get_message_by_name("ACM")
     control = Control(150.0, 18.0, 80.0, motion_enable=True)
