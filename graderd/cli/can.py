@@ -1,4 +1,4 @@
-"""``graderd can dump``: the bus, decoded."""
+"""``graderd can dump``: the bus, decoded. ``graderd can database``: its messages, for other tools."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from graderd.client import Client, NoDaemonError
 from graderd.hal.text import printable
 
 _MODULE = "graderd.drivers.electrak.dump"
+_DATABASE_MODULE = "graderd.runtime.app.can_database"
 
 
 def register(app: typer.Typer) -> None:
@@ -44,6 +45,18 @@ def register(app: typer.Typer) -> None:
             through(client, [argument for argument in arguments if argument not in sources])
         else:
             hand_over(_MODULE, arguments)
+
+    @can.command(
+        context_settings=TAKES_ANYTHING,
+        epilog=example(
+            "graderd can database > machine.dbc          (SavvyCAN, cantools, BUSMASTER)",
+            "graderd can database --kcd > machine.kcd    (Kayak)",
+            "graderd can database -- --help              (all its options)",
+        ),
+    )
+    def database(context: typer.Context) -> None:
+        """Print a DBC file with one message for each actuator as it is configured."""
+        hand_over(_DATABASE_MODULE, [argument for argument in context.args if argument != "--"])
 
 
 def is_the_daemons(client: Client, sources: list[str]) -> bool:
