@@ -247,8 +247,8 @@ class ElectrakSettings(ActuatorSettings):
 class PluginActuatorSettings(ActuatorSettings):
     """One linear actuator by a driver from elsewhere; its stroke is not graderd's to guess."""
 
-    min_mm: NotNegative = Field(description="limit of extension, for gate and driver alike")
-    max_mm: Positive = Field(description="limit of extension, for gate and driver alike")
+    min_mm: NotNegative = Field(le=1000, description="limit of extension, for gate and driver alike")
+    max_mm: Positive = Field(le=1000, description="limit of extension, for gate and driver alike")
     driver: DriverTable
 
 
