@@ -104,7 +104,9 @@ def stretch_of_work() -> list[Sensed]:
             for axis, decided in tick.axes.items()
             if decided.send is not None or (axis in goals and not decided.hold)
         }
-        at |= goals
+        for axis, goal in goals.items():
+            most = SETTINGS.figures[axis].speed * TICK_S
+            at[axis] += min(max(goal - at[axis], -most), most)
         found.append(sensed)
     return found
 
