@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 
-from graderd.drivers.dynamixel.bus import BusLog, ServoBus
+from graderd.drivers.dynamixel.bus import BusLog, ServoBus, ServoRefusedError
 from graderd.drivers.dynamixel.device import Ph54Device
 from graderd.drivers.dynamixel.serial_port import ListPorts, find_port
 from graderd.drivers.dynamixel.table import ControlTable
@@ -142,7 +142,7 @@ class ServoLink:
 
 def condition_of(error: DeviceError) -> str:
     """The fault's name for an error that ended or prevented a connection."""
-    if isinstance(error, WrongDeviceError):
+    if isinstance(error, WrongDeviceError | ServoRefusedError):  # a read refused: not this control table
         return "wrong_device"
     if isinstance(error, DeviceMissingError | DeviceLostError):
         return "unplugged"

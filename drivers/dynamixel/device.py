@@ -13,6 +13,8 @@ from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError, WrongDevi
 EXTENDED_MODE, POSITION_MODE = 4, 3
 WATCHDOG_TRIPPED = -1
 WATCHDOG_STEP_S = 0.020
+WITNESS = {"led_green": 0x47, "led_blue": 0x52}
+"""Left in the servo's RAM once its turns are known: a restart forgets it as it forgets the turns. The LED shows it."""
 _RUN_BYTES = 64
 ATTEMPTS_N = 8
 """Attempts of a request on which a whole procedure depends (opening, arming); polling has the next poll instead."""
@@ -44,6 +46,7 @@ class Ph54Device:
         telemetry = table.profile["telemetry"]
         self.telemetry_block = table.block(telemetry["first"], telemetry["last"])
         self.health_block = table.block("torque_enable", "hardware_error_status")
+        self.witness_block = table.block("led_green", "led_blue")
         self.goal_block = table.block("bus_watchdog", "goal_position")
         self.arm_block = table.block("goal_current", "goal_position")
         self.profile_block = table.block("profile_acceleration", "goal_position")

@@ -20,6 +20,7 @@ from graderd.drivers.dynamixel.device import EXTENDED_MODE, POSITION_MODE, Diffe
 from graderd.drivers.dynamixel.observer import ServoObserver
 from graderd.drivers.dynamixel.serial_port import ListPorts, system_ports
 from graderd.drivers.dynamixel.servo_task import DEVICE, LINK_FAULTS, CommandSlot, ServoTask
+from graderd.drivers.dynamixel.states import Event
 from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import (
@@ -85,7 +86,8 @@ class Ph54Rotator:
 
     def telemetry(self) -> RotatorTelemetry:
         """Newest readings, each with its time; ``counters`` tell the wire's history."""
-        return replace(self._observer.telemetry, counters=self._link.counters())
+        counters = {**self._link.counters(), "implausible_n": self._observer.implausible_n}
+        return replace(self._observer.telemetry, counters=counters)
 
     def faults(self) -> tuple[DeviceFault, ...]:
         """Conditions present now. Events (trips, lost turns) stay visible for a second after they happened."""
@@ -112,7 +114,7 @@ class Ph54Rotator:
             if isinstance(e, DeviceError):
                 self._observer.faults.set(condition_of(e), e.cause, self._clock.now_s())
             raise
-        self._keeper.lifecycle = Lifecycle.STANDBY
+        self._keeper.note(Event.OPENED)
         self._keeper.start()
 
     async def arm(self) -> None:
@@ -126,16 +128,16 @@ class Ph54Rotator:
             self._require(Lifecycle.STANDBY)
             device = self._link.device
             self._keeper.torque_is_ours = True
-            counts = await arming.power_up(device, self.settings, self.calibration)
+            armed = await arming.power_up(device, self.settings, self.calibration)
             if self._keeper.lifecycle is not Lifecycle.STANDBY:  # closed in the meantime
                 await device.torque(False)
                 raise LifecycleError(DEVICE, f"became {self._keeper.lifecycle} while it was being armed")
-            self._command.forget(counts)
-            self._observer.note_sent(counts)
+            self._command.armed(armed)
+            self._observer.note_sent(armed.goal_counts)
             self._observer.restart()
             self._observer.set_torque(True)
             self._observer.tripped = False
-            self._keeper.lifecycle = Lifecycle.ACTIVE
+            self._keeper.note(Event.ARMED)
 
     def set_goal_deg(self, goal_deg: float) -> None:
         """Take a new goal; sent at once by the driver's own task. See :meth:`graderd.hal.rotator.Rotator`."""
@@ -159,14 +161,15 @@ class Ph54Rotator:
         """active -> standby: hold, come to rest, then torque as ``torque_at_disarm`` says. Elsewhere: nothing to do."""
         if self._keeper.lifecycle is not Lifecycle.ACTIVE:
             return
-        self._keeper.lifecycle = Lifecycle.STANDBY
+        self._keeper.note(Event.DISARMED)
         await self._keeper.power_down(off=self.settings.torque_at_disarm == "off")
 
     async def close(self) -> None:
         """Any state -> closed: torque as ``torque_at_exit`` says where it was switched on by us, then let go."""
         if self._keeper.lifecycle is Lifecycle.CLOSED:
             return
-        was, self._keeper.lifecycle = self._keeper.lifecycle, Lifecycle.CLOSED
+        was = self._keeper.lifecycle
+        self._keeper.note(Event.CLOSED)
         if was is not Lifecycle.FAILED and self._keeper.torque_is_ours and self._observer.torque_on:
             try:
                 async with asyncio.timeout(_CLOSE_S):
@@ -186,7 +189,7 @@ class Ph54Rotator:
         self._require(Lifecycle.STANDBY)
         async with self._keeper.turn:
             self._require(Lifecycle.STANDBY)
-            self._keeper.lifecycle = Lifecycle.FAILED
+            self._keeper.note(Event.LOST)
             self._keeper.torque_is_ours = False
             try:
                 await self._link.reboot()
@@ -196,8 +199,7 @@ class Ph54Rotator:
                 if self._link.bus is not None:
                     self._link.bus.close()  # the servo task finds the line closed and starts anew
                 raise
-            if self._keeper.lifecycle is Lifecycle.FAILED:
-                self._keeper.lifecycle = Lifecycle.STANDBY
+            self._keeper.note(Event.FOUND)
 
     async def verify_profile(self) -> list[Difference]:
         """Read every register and compare it with the firmware profile; reads only, in every open state.
@@ -212,8 +214,7 @@ class Ph54Rotator:
 
     def confirm_turns(self) -> None:
         """The operator says that the angle shown is the blade's: whole turns are known again."""
-        self._observer.turns_unknown = False
-        self._observer.faults.clear("turns_lost")
+        self._observer.confirm_turns()
 
     def _require(self, state: Lifecycle) -> None:
         if self._keeper.lifecycle is not state:

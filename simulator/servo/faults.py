@@ -42,6 +42,7 @@ FAULTS: dict[str, FaultKind] = {
     # on the wire
     "drop": FaultKind("status packets are lost with this probability", {"rate": 1.0}),
     "drop_requests": FaultKind("instruction packets are lost with this probability", {"rate": 1.0}),
+    "damage_requests": FaultKind("instructions arrive damaged, are answered CRC Error, with this rate", {"rate": 1.0}),
     "delay": FaultKind("status packets come later", {"seconds": 0.03}),
     "flip": FaultKind("one bit of a status packet is flipped with this probability", {"rate": 1.0}),
     "truncate": FaultKind("the end of a status packet is missing with this probability", {"rate": 1.0}),
@@ -53,6 +54,9 @@ FAULTS: dict[str, FaultKind] = {
     # in the servo
     "power_cut": FaultKind("the 24 V supply fails; back after `seconds`, 0: when faults are cleared", {"seconds": 0.0}),
     "ram_reset": FaultKind("a supply dip resets the RAM registers at once, without silence"),
+    "refuse": FaultKind("writes that begin at `address` are refused with `error`", {"address": 556, "error": 6}),
+    "wrong_position": FaultKind("so many position readings are off, with a right CRC", {"deg": 30.0, "reads_n": 1}),
+    "keeps_turns": FaultKind("torque-on in position mode does not bring the count back to within one turn"),
     "torque_off": FaultKind("torque is switched off by somebody else"),
     "turns_lost": FaultKind("the multi-turn count is off by so many turns", {"turns_n": 1}),
     "wrong_model": FaultKind("another model answers", {"model_n": 2010}),
