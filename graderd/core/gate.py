@@ -1,8 +1,8 @@
 """The gate: the only way out. Every goal passes here, or the axis stays where it is.
 
 Order of the checks, the first that fails decides: mode, lease, finite number, fresh measurement, interlocks, then the
-bounds (absolute limits and the working window around the armed pose) and the motion limits (speed, acceleration, and
-how far the goal may run ahead of the measured position).
+bounds (absolute limits and the working window around the armed pose) and the motion limits (how far the goal may run
+ahead of the measured position; speed and acceleration where the device has no profile of its own).
 A goal beyond a bound is not "corrected": it is limited to the bound and the result says so.
 """
 
@@ -86,7 +86,10 @@ def pass_gate(state: GateState, goals: Goals, inputs: GateInputs) -> tuple[GateS
             passed[axis] = AxisPass(requested, None, refusal)
             continue
         bounded, why = _bound(requested, figures, former.armed_at)
-        advanced = _fence(_advance(former, bounded, figures, inputs.dt_s), former, figures)
+        if figures.profile_in_device:  # a second profile before the device's own would only fight it
+            advanced = replace(former, position=bounded, speed=0.0)
+        else:
+            advanced = _fence(_advance(former, bounded, figures, inputs.dt_s), former, figures)
         setpoints[axis] = _lead(advanced, measured, figures)
         passed[axis] = AxisPass(requested, setpoints[axis].position, why)
     return GateState(setpoints), passed
