@@ -104,7 +104,9 @@ def stretch_of_work() -> list[Sensed]:
             for axis, decided in tick.axes.items()
             if decided.send is not None or (axis in goals and not decided.hold)
         }
-        at |= goals
+        turned = goals.get("rotation", at["rotation"])
+        way = 25.0 * TICK_S  # the servo turns with its own speed
+        at |= goals | {"rotation": min(at["rotation"] + way, max(at["rotation"] - way, turned))}
         found.append(sensed)
     return found
 
