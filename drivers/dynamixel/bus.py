@@ -171,7 +171,7 @@ class ServoBus:
         self._counters = dict.fromkeys(
             (
                 "requests_n", "replies_n", "retries_n", "timeouts_n", "refused_n", "foreign_n", "late_n", "echo_n",
-                "invalid_n", "fences_n", "damaged_requests_n", "blocked_n",
+                "invalid_n", "fences_n", "damaged_requests_n", "blocked_n", "doubled_n",
             ),
             0,
         )  # fmt: skip
@@ -251,6 +251,11 @@ class ServoBus:
         """
         data = (await self.request(servo_id, Instruction.PING, b"", _PING_DATA_BYTES, attempts_n=attempts_n)).data
         return data[0] | data[1] << 8, data[2]
+
+    async def answers_twice(self) -> bool:
+        """Whether a request so far drew two answers; waits until the second to the last one had its time."""
+        await asyncio.sleep(self._allowance.now_s)
+        return self._counters["doubled_n"] > 0
 
     async def read(self, servo_id: int, address: int, size: int, *, attempts_n: int = 2) -> Packet:
         """``size`` bytes from ``address``; the packet's ``data`` holds exactly that many, ``alert`` stands beside it.
@@ -464,6 +469,8 @@ class ServoBus:
         if not packet.is_status:
             counters["echo_n"] += 1
         elif reply is None or reply.done():
+            if packet.packet_id == self._wanted_id and not self._counters["timeouts_n"]:
+                counters["doubled_n"] += 1  # nothing was ever given up that could be late
             self._note_late()
         elif packet.packet_id != self._wanted_id:
             counters["foreign_n"] += 1

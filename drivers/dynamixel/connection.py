@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
+from collections import Counter, deque
 
 from graderd.drivers.dynamixel.bus import BusLog, ServoBus, ServoRefusedError
 from graderd.drivers.dynamixel.device import Ph54Device
@@ -25,6 +25,9 @@ _REBOOT_S = 5.0
 _LOOK_EVERY_S = 0.05
 _MANY = 1_000_000
 _LATENCY_WANTED_MS = 1
+_LOSS_WINDOW_S, _LOSS_REQUESTS_N, _LOSS_SHARE = 2.0, 40, 0.05
+_LOSS_COUNTERS = ("requests_n", "timeouts_n")
+"""So large a share of at least so many requests without an answer, within the window, is told."""
 
 
 class ServoLink:
@@ -44,6 +47,9 @@ class ServoLink:
         self.bus: ServoBus | None = None
         self.slow_adapter: DeviceFault | None = None
         """The present adapter holds bytes back, which makes every reply late, whatever the baud rate."""
+        self.lossy: DeviceFault | None = None
+        """The present line loses more than it should."""
+        self._told: deque[tuple[float, int, int]] = deque()
         self._settings = settings
         self._table = table
         self._mode = expected_mode
@@ -97,10 +103,30 @@ class ServoLink:
         detail = f"{bus.port}: latency timer {timer_ms} ms, {_LATENCY_WANTED_MS} ms is wanted"
         return DeviceFault("servo_bus", "adapter_latency", detail, self._clock.now_s())
 
+    def judge_loss(self) -> None:
+        """Tell a line that loses much, while repeats still make up for it; called with every poll."""
+        if self.bus is None:
+            return
+        now_s, counted = self._clock.now_s(), self.bus.counters()
+        self._told.append((now_s, counted["requests_n"], counted["timeouts_n"]))
+        while now_s - self._told[0][0] > _LOSS_WINDOW_S:
+            self._told.popleft()
+        requests_n, lost_n = (
+            counted[name] - first for name, first in zip(_LOSS_COUNTERS, self._told[0][1:], strict=True)
+        )
+        if requests_n < _LOSS_REQUESTS_N:
+            return
+        if lost_n <= _LOSS_SHARE * requests_n:
+            self.lossy = None
+        elif self.lossy is None:
+            detail = f"{lost_n} of {requests_n} requests within {_LOSS_WINDOW_S:g} s had no answer"
+            self.lossy = DeviceFault("servo_bus", "lossy", detail, now_s)
+
     def disconnect(self) -> None:
         """Let go of the port and remember what was counted. Idempotent."""
         self._device = None
-        self.slow_adapter = None
+        self.slow_adapter = self.lossy = None
+        self._told.clear()
         if self.bus is not None:
             bus, self.bus = self.bus, None
             bus.close()

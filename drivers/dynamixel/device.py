@@ -119,6 +119,12 @@ class Ph54Device:
                 f"nothing answers at {bus.baud_n} bit/s",
                 "Check the 24 V supply, the RS-485 cable, rotation.servo_id_n and rotation.baud_n",
             ) from e
+        if await bus.answers_twice():
+            raise WrongDeviceError(
+                self.where,
+                f"two servos answer to id {self.servo_id}",
+                "Leave one of them on the bus and give it another id",
+            )
         if model != table.model_number:
             raise WrongDeviceError(
                 self.where,

@@ -91,8 +91,8 @@ class Ph54Rotator:
 
     def faults(self) -> tuple[DeviceFault, ...]:
         """Conditions present now. Events (trips, lost turns) stay visible for a second after they happened."""
-        present, slow = self._observer.faults.present(self._clock.now_s()), self._link.slow_adapter
-        return present if slow is None else (*present, slow)
+        present = self._observer.faults.present(self._clock.now_s())
+        return (*present, *(fault for fault in (self._link.slow_adapter, self._link.lossy) if fault is not None))
 
     async def wait_telemetry(self) -> RotatorTelemetry:
         """The next telemetry, as soon as it was read (or the connection's state changed)."""

@@ -85,7 +85,7 @@ class CommandSlot:
         """Whether a hold went out after that reading: the blade may brake since, and the reading not know of it."""
         return self._held_deg is not None and motion.time_s < self._held_s
 
-    async def send_hold(self, device: Ph54Device, motion: ServoMotion, now_s: float) -> int:
+    async def send_hold(self, device: Ph54Device, motion: ServoMotion, now_s: float, *, attempts_n: int = 1) -> int:
         """The goal where it comes to rest soonest, with a harder profile, in one packet. Returns the counts sent.
 
         A servo that refuses the profile still gets the goal, and brakes with the profile it has. Where a former hold
@@ -101,13 +101,13 @@ class CommandSlot:
             counts = self._rest_counts(motion, now_s, hard)
             values = {**profile, "profile_acceleration": hard, "goal_position": counts}
             self._hard_profile = True
-            await device.write_block(device.profile_block, values, attempts_n=1, urgent=True)
+            await device.write_block(device.profile_block, values, attempts_n=attempts_n, urgent=True)
         except ServoRefusedError as e:
             self._held_deg, self._hard_profile = None, False
             if e.error == StatusError.DATA_RANGE:  # its watchdog has tripped: it brakes by itself
                 raise
             counts = self._rest_counts(motion, now_s, gentle)
-            await device.write("goal_position", counts, attempts_n=1, urgent=True)
+            await device.write("goal_position", counts, attempts_n=attempts_n, urgent=True)
         self._holding, self.hold_wanted = True, False
         return counts
 
@@ -431,6 +431,7 @@ class ServoTask:
         await self._tolerant(self._protect(device))
         if self._link.bus is not None:
             observer.count_damage(self._link.bus)
+            self._link.judge_loss()
 
     async def _leave_witness(self, device: Ph54Device) -> None:
         """The servo's RAM shall say whether its turns are known."""

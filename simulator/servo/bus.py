@@ -320,6 +320,10 @@ class VirtualServoBus:
             reply = reply[: at // 8] + bytes((reply[at // 8] ^ 1 << at % 8,)) + reply[at // 8 + 1 :]
         if self._strikes("truncate"):
             reply = reply[: self._random.randrange(1, len(reply))]
+        if "babble" in self._faults:
+            reply = reply[:5] + int(self._faults["babble"]["length"]).to_bytes(2, "little") + reply
+        if "twin" in self._faults:
+            reply += reply
         if "noise" in self._faults:
             reply = self._random.randbytes(int(self._faults["noise"]["bytes_n"])) + reply
         return reply

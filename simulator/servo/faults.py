@@ -49,6 +49,8 @@ FAULTS: dict[str, FaultKind] = {
     "echo": FaultKind("the adapter echoes what the host sends"),
     "foreign_id": FaultKind("status packets carry another servo's id", {"servo_id": 99}),
     "noise": FaultKind("stray bytes before status packets", {"bytes_n": 7}),
+    "babble": FaultKind("before status packets a header that claims so long a packet", {"length": 1000}),
+    "twin": FaultKind("a second servo with the same id answers too"),
     "trickle": FaultKind("bytes come and go one at a time", {"gap_s": 0.0003}),
     "unplug": FaultKind("the cable is pulled: port and link vanish"),
     # in the servo
