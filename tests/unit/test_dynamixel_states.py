@@ -13,7 +13,7 @@ from graderd.drivers.dynamixel.states import Event, after
 from graderd.hal.lifecycle import Lifecycle
 
 
-@pytest.mark.parametrize(("state", "event"), product(Lifecycle, Event))
+@pytest.mark.parametrize(("state", "event"), list(product(Lifecycle, Event)))
 def test_every_state_and_event(state: Lifecycle, event: Event) -> None:
     new = after(state, event)
     if new is Lifecycle.ACTIVE:  # nothing but arming a servo in standby makes it active, nothing keeps it so
