@@ -19,7 +19,15 @@ from typing import Final, Literal
 import serial
 
 from graderd.drivers.dynamixel import serial_port
-from graderd.drivers.dynamixel.codec import BROADCAST_ID, Instruction, Packet, StatusError, StreamDecoder, encode
+from graderd.drivers.dynamixel.codec import (
+    BROADCAST_ID,
+    MAX_ID,
+    Instruction,
+    Packet,
+    StatusError,
+    StreamDecoder,
+    encode,
+)
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import DeviceError, DeviceLostError, DeviceRefusedError, DeviceTimeoutError
 
@@ -165,6 +173,7 @@ class ServoBus:
         self._allowance = Allowance()
         self._reply: asyncio.Future[Packet | None] | None = None
         self._room: asyncio.Future[None] | None = None
+        self._everybody: list[Packet] | None = None
         self._wanted_id = 0
         self._wanted_data_n: int | None = None
         self._suspect = False
@@ -251,6 +260,22 @@ class ServoBus:
         """
         data = (await self.request(servo_id, Instruction.PING, b"", _PING_DATA_BYTES, attempts_n=attempts_n)).data
         return data[0] | data[1] << 8, data[2]
+
+    async def ping_all(self) -> list[tuple[int, int, int]]:
+        """Id, model number and firmware version of all that answer a broadcast ping, each in its turn."""
+        await self._access.take(False)
+        heard: list[Packet] = []
+        self._everybody = heard
+        try:
+            await self._transmit(encode(BROADCAST_ID, Instruction.PING))
+            answer_s = (_STATUS_BYTES + _PING_DATA_BYTES) * self._byte_s + self._return_delay_s
+            await asyncio.sleep(_ALLOWANCE_MAX_S + MAX_ID * answer_s)
+        finally:
+            self._everybody = None
+            self._suspect = True
+            self._access.give_back()
+        pings = [p for p in heard if len(p.data) == _PING_DATA_BYTES]
+        return [(p.packet_id, p.data[0] | p.data[1] << 8, p.data[2]) for p in pings]
 
     async def answers_twice(self) -> bool:
         """Whether a request so far drew two answers; waits until the second to the last one had its time."""
@@ -468,6 +493,8 @@ class ServoBus:
         counters, reply = self._counters, self._reply
         if not packet.is_status:
             counters["echo_n"] += 1
+        elif self._everybody is not None:
+            self._everybody.append(packet)
         elif reply is None or reply.done():
             if packet.packet_id == self._wanted_id and not self._counters["timeouts_n"]:
                 counters["doubled_n"] += 1  # nothing was ever given up that could be late

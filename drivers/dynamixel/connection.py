@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections import Counter, deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
 
 from graderd.drivers.dynamixel.bus import BusLog, ServoBus, ServoRefusedError
 from graderd.drivers.dynamixel.device import Ph54Device
@@ -28,6 +32,19 @@ _LATENCY_WANTED_MS = 1
 _LOSS_WINDOW_S, _LOSS_REQUESTS_N, _LOSS_SHARE = 2.0, 40, 0.05
 _LOSS_COUNTERS = ("requests_n", "timeouts_n")
 """So large a share of at least so many requests without an answer, within the window, is told."""
+
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """One servo that answered a scan."""
+
+    baud_n: int
+    servo_id_n: int
+    model_n: int
+    firmware_version: int
 
 
 class ServoLink:
@@ -81,19 +98,55 @@ class ServoLink:
             DeviceMissingError, DeviceRefusedError: as for the port.
             WrongDeviceError, DeviceTimeoutError, DeviceLostError: as :meth:`Ph54Device.identify`.
         """
-        s = self._settings
-        rates = self._table.profile["bus"]["baud_n"]
-        if s.baud_n not in rates:
-            cause = f"{self._table.title} cannot run at {s.baud_n} bit/s"
-            raise DeviceRefusedError("rotation", cause, f"Choose one of {rates}")
-        port = find_port(s.port, s.usb_serial_number, self._list_ports)
-        self.bus = ServoBus(port, s.baud_n, clock=self._clock, bus_log=self._bus_log)
-        self.bus.open()
-        self.slow_adapter = self._judge_adapter(self.bus)
-        device = Ph54Device(self.bus, self._table, s.servo_id_n)
+        device = self._open(self._settings.baud_n)
         self.firmware_version = await device.identify(self._mode)
         self._device = device
         return device
+
+    @asynccontextmanager
+    async def visit(self) -> AsyncIterator[Ph54Device]:
+        """The servo as it is, fit or not; a wire that was not up is let go of again.
+
+        Raises:
+            DeviceMissingError, DeviceRefusedError: as for the port.
+        """
+        if self.is_up:
+            yield self.device
+            return
+        self.disconnect()
+        try:
+            yield self._open(self._settings.baud_n)
+        finally:
+            self.disconnect()
+
+    async def scan(self) -> list[Found]:
+        """Every servo that answers, at every rate the model knows. Nothing but pings is sent; the wire is let go of.
+
+        Raises:
+            DeviceMissingError: as for the port.
+        """
+        found: list[Found] = []
+        for baud_n in sorted(self._table.profile["bus"]["baud_n"]):
+            self.disconnect()
+            try:
+                bus = self._open(baud_n).bus
+                found += [Found(baud_n, *answer) for answer in await bus.ping_all()]
+            except (DeviceRefusedError, DeviceLostError) as e:  # a rate this adapter cannot do
+                log.info("scan: %s", e)
+            finally:
+                self.disconnect()
+        return found
+
+    def _open(self, baud_n: int) -> Ph54Device:
+        s, rates = self._settings, self._table.profile["bus"]["baud_n"]
+        if baud_n not in rates:
+            cause = f"{self._table.title} cannot run at {baud_n} bit/s"
+            raise DeviceRefusedError("rotation", cause, f"Choose one of {rates}")
+        port = find_port(s.port, s.usb_serial_number, self._list_ports)
+        self.bus = ServoBus(port, baud_n, clock=self._clock, bus_log=self._bus_log)
+        self.bus.open()
+        self.slow_adapter = self._judge_adapter(self.bus)
+        return Ph54Device(self.bus, self._table, s.servo_id_n)
 
     def _judge_adapter(self, bus: ServoBus) -> DeviceFault | None:
         """Adapters without a latency timer, and ptys, hold nothing back."""

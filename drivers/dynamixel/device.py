@@ -24,8 +24,8 @@ ATTEMPTS_N = 8
 class Difference:
     """One register whose content is not what the profile says.
 
-    ``kind``: ``expected`` (judged at every start), ``range`` (outside the documented range), ``default`` (legal, but
-    not the factory's value), ``refused`` (the servo does not know the register).
+    ``kind``: ``expected`` (judged at every start), ``range`` (outside the documented range), ``refused`` (the servo
+    does not know the register): these are wrong. ``default`` is not: legal, and neither the factory's value nor ours.
     """
 
     register: str
@@ -148,8 +148,8 @@ class Ph54Device:
         limits, _ = await self.read_block(self.table.block("velocity_limit", "shutdown"))
         return {**first, **limits}
 
-    async def verify(self, expected_mode: int) -> list[Difference]:
-        """Read every register and compare it with the profile; reads only.
+    async def verify(self, expected_mode: int, written: Mapping[str, int]) -> list[Difference]:
+        """Read every register and compare it with the profile; reads only. ``written``: what arming writes is right.
 
         Raises:
             DeviceTimeoutError, DeviceLostError: the servo stopped answering.
@@ -170,7 +170,8 @@ class Ph54Device:
         found += judge(self.table, values, firmware, expected_mode)
         judged = {d.register for d in found}
         for register in self.table.registers:
-            if register.name in values and register.name not in judged:
+            name = register.name
+            if name in values and name not in judged and values[name] != written.get(name):
                 found += _compare(self.table, register, values[register.name])
         return sorted(found, key=lambda d: d.address)
 
@@ -230,7 +231,9 @@ def _compare(table: ControlTable, register: Register, value: int) -> list[Differ
     ]
     kept = register.eeprom and (register.writable or register.name == "model_number")
     if kept and value != register.default and value not in disputed:
-        return difference("default", str(register.default), "factory value is")
+        return difference(
+            "expected" if register.name == "model_number" else "default", str(register.default), "factory value is"
+        )
     return []
 
 

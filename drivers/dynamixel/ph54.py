@@ -15,7 +15,7 @@ from dataclasses import replace
 from graderd.drivers.dynamixel import arming
 from graderd.drivers.dynamixel.bus import BusLog
 from graderd.drivers.dynamixel.calibration import Calibration
-from graderd.drivers.dynamixel.connection import ServoLink, condition_of
+from graderd.drivers.dynamixel.connection import Found, ServoLink, condition_of
 from graderd.drivers.dynamixel.device import EXTENDED_MODE, POSITION_MODE, Difference
 from graderd.drivers.dynamixel.observer import ServoObserver
 from graderd.drivers.dynamixel.serial_port import ListPorts, system_ports
@@ -108,7 +108,8 @@ class Ph54Rotator:
         self._keeper.torque_is_ours = False
         self._command.forget()
         try:
-            await self._keeper.connect()
+            async with self._keeper.turn:
+                await self._keeper.connect()
         except BaseException as e:
             self._link.disconnect()
             if isinstance(e, DeviceError):
@@ -202,15 +203,31 @@ class Ph54Rotator:
             self._keeper.note(Event.FOUND)
 
     async def verify_profile(self) -> list[Difference]:
-        """Read every register and compare it with the firmware profile; reads only, in every open state.
+        """Read every register and compare it with the firmware profile and what arming writes; reads only.
+
+        In every state: a servo that was refused for its settings is the one that has to be looked at.
 
         Raises:
-            LifecycleError: closed or lost.
-            DeviceTimeoutError, DeviceLostError: the servo stopped answering.
+            DeviceMissingError, DeviceTimeoutError, DeviceLostError: the servo cannot be reached.
         """
-        if self._keeper.lifecycle not in (Lifecycle.STANDBY, Lifecycle.ACTIVE):
-            raise LifecycleError(DEVICE, f"cannot read the servo while {self._keeper.lifecycle}", "Check the wire")
-        return await self._link.device.verify(self._mode)
+        written = arming.eeprom_counts(self.settings, self.calibration)
+        if self._link.is_up:  # polling goes on between the reads
+            return await self._link.device.verify(self._mode, written)
+        async with self._keeper.turn, self._link.visit() as device:
+            return await device.verify(self._mode, written)
+
+    async def scan(self) -> list[Found]:
+        """Every servo on the wire, at every baud rate; the servo in use is lost for that long and found again.
+
+        Raises:
+            LifecycleError: active.
+            DeviceMissingError: there is no port.
+        """
+        if self._keeper.lifecycle is Lifecycle.ACTIVE:
+            raise LifecycleError(DEVICE, "cannot look for others while it is armed", "Disarm first")
+        async with self._keeper.turn:
+            self._keeper.note(Event.LOST)
+            return await self._link.scan()
 
     def confirm_turns(self) -> None:
         """The operator says that the angle shown is the blade's: whole turns are known again."""
