@@ -207,7 +207,7 @@ async def test_a_register_the_servo_does_not_know_is_a_difference(tmp_path: Path
     await wire.start()
     bus = ServoBus(str(tmp_path / "servo"), 57_600)
     bus.open()
-    (difference,) = await Ph54Device(bus, TABLE, 1).verify(3)
+    (difference,) = await Ph54Device(bus, TABLE, 1).verify(3, {})
     assert (difference.register, difference.kind, difference.device) == ("backup_ready", "refused", None)
     assert StatusError.ACCESS.name.lower() in difference.text
     bus.close()
