@@ -81,7 +81,7 @@ test-python-%: $(STAMP)
 	$(MAKE) --no-print-directory VENV=.venv-$* PYTHON=$$python $(PYTHON_TARGETS)
 
 faults: $(STAMP) ## inject every fault in every phase of work (ARGS="--short --json" for a part of it)
-	@$(BIN)/python -m tests.fault.campaign $(ARGS)
+	@$(BIN)/python -m harness.campaign $(ARGS)
 
 deb: $(STAMP) ## build dist/graderd_VERSION_ARCH.deb (DEB_ARGS="--arch arm64"); needs dpkg-deb and git
 	@$(BIN)/python packaging/build_deb.py $(DEB_ARGS)

@@ -17,7 +17,7 @@ from typing import Any
 
 from graderd.api.settings import ApiLimits
 from graderd.core.machine import Mode
-from tests.unit.api_daemon import FakeDaemon, serving
+from harness.api_daemon import FakeDaemon, serving
 
 FLOOD_S = 4.0
 CASES = (("none", 0), ("ask", 100), ("ask", 400), ("hammer", 50), ("stop", 100))
@@ -52,7 +52,7 @@ async def measure(kind: str, connections_n: int, limits: ApiLimits) -> dict[str,
     """One flood."""
     with tempfile.TemporaryDirectory() as directory:
         async with serving(Path(directory), limits=limits) as (daemon, path):
-            flood = await _start("tests.unit.api_flood", str(path), str(FLOOD_S), kind, str(connections_n))
+            flood = await _start("harness.api_flood", str(path), str(FLOOD_S), kind, str(connections_n))
             await asyncio.sleep(1.0)
             daemon.late_s.clear()
             await asyncio.sleep(FLOOD_S / 4)

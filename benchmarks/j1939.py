@@ -85,6 +85,8 @@ class Axis:
     def control_frame(self, source: int, _now_s: float) -> Frame:
         return Frame(make_id(6, Pgn.PROPRIETARY_A, source, self.address), self._codec.encode_control(self._control))
 
+    def stop_frame(self, source: int, now_s: float) -> Frame | None: ...
+
     def on_feedback(self, data: bytes, _now_s: float) -> None:
         self._codec.decode_feedback(data)
         self.heard_n += 1

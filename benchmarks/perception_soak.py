@@ -32,8 +32,8 @@ from graderd.perception import CameraCalibration, PerceptionSettings
 from graderd.runtime.app import perception_child as worker_process
 from graderd.runtime.app.frame_sources import open_camera
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
-from tests.perception_scenes import Scene, render
-from tests.realsense_devices import Color, Depth, SoftD455, record
+from harness.perception_scenes import Scene, render
+from harness.realsense_devices import Color, Depth, SoftD455, record
 
 HOUR_N = 108_000
 RATE_HZ = 30.0

@@ -15,9 +15,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.fault.campaign.model import Phase
-from tests.fault.campaign.stack import Stack
-from tests.fault.test_stop_everywhere import WAYS, stopped_in_motion
+from harness.campaign.model import Phase
+from harness.campaign.stack import Stack
+from harness.stops import WAYS, stopped_in_motion
 
 TICK_MS = 20.0
 SERVO_WIRE_MS = 8.0
@@ -58,7 +58,7 @@ async def measure(rounds_n: int, flood: bool) -> list[dict[str, object]]:
 
 async def _flood(stack: Stack) -> asyncio.subprocess.Process:
     return await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "tests.fault.campaign.flood", str(stack.directory / "graderd.sock"), "6.0"),
+        *(sys.executable, "-m", "harness.campaign.flood", str(stack.directory / "graderd.sock"), "6.0"),
         stdout=asyncio.subprocess.DEVNULL,
     )
 

@@ -19,7 +19,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from hil.service import SOCKET, Api, Refused, Status, WaitError, brief, faults, wait_for
+from graderd.client import Client, NoDaemonError, RefusedError
+from hil.service import SOCKET, Status, WaitError, brief, faults, wait_for
 
 RESULTS: Final = Path(__file__).resolve().parent.parent / "var" / "bench"
 RENEW_S: Final = 0.1
@@ -44,10 +45,14 @@ class Result:
 class Bench:
     """One session at the machine. ``ask`` puts a question to the person and returns the answer."""
 
-    def __init__(self, api: Api, ask: Callable[[str], str]) -> None:
-        self._api = api
+    def __init__(self, client: Client, ask: Callable[[str], str]) -> None:
+        self._client = client
         self._ask = ask
         self.results: list[Result] = []
+
+    def _status(self) -> Status:
+        found: Status = self._client.get("/v1/status")
+        return found
 
     def confirmed(self, what: str) -> bool:
         """Whether the person allows this one motion."""
@@ -64,26 +69,26 @@ class Bench:
                     self._attempt(name, partial(self.step_response, name, axis, unit, value))
             self._attempt("stop in motion", self.stop_in_motion)
         finally:
-            self._api.stop()
-            self._api.command("reset")
+            self._client.stop()
+            self._client.reset()
 
     def stop_works(self) -> None:
         """Stop latches, arming is refused while it does, reset leaves it."""
-        self._api.stop()
+        self._client.stop()
         refused = False
         try:
-            self._api.command("arm")
-        except Refused:
+            self._client.command("arm")
+        except RefusedError:
             refused = True
-        mode = self._api.status()["mode"]
-        self._api.command("reset")
+        mode = self._status()["mode"]
+        self._client.reset()
         self._note("stop latches", ok=refused and mode == "stopped", mode=mode)
 
     def contract(self) -> None:
         """Every axis is readable in standby, with fresh readings and no fault; nothing moves for two seconds."""
-        first = self._api.status()
+        first = self._status()
         time.sleep(2.0)
-        second = self._api.status()
+        second = self._status()
         figures: dict[str, float | str] = {"faults": ", ".join(sorted(faults(second)))}
         still = True
         for name, axis in second["axes"].items():
@@ -109,7 +114,7 @@ class Bench:
         sign = 1.0 if value > 0 else -1.0
         began_s = next((t for t, y in moved if abs(y) > 0.1 * abs(value)), float("nan"))
         peak = max(y * sign for _, y in moved)
-        self._api.command("disarm")
+        self._client.command("disarm")
         self._note(
             name,
             ok=abs(moved[-1][1] - value) <= tolerance,
@@ -128,42 +133,42 @@ class Bench:
         start = self._measured("rotation")
         self._jog("rotate", 10.0, lambda status: abs(status["axes"]["rotation"]["measured"] - start) > 3.0)
         at, began_s = self._measured("rotation"), time.monotonic()
-        self._api.stop()
-        wait_for("a stand", lambda: not self._api.status()["axes"]["rotation"]["moving"], 3.0, 0.02)
+        self._client.stop()
+        wait_for("a stand", lambda: not self._status()["axes"]["rotation"]["moving"], 3.0, 0.02)
         stood_s = time.monotonic() - began_s
         after = self._measured("rotation") - at
-        self._api.command("reset")
+        self._client.reset()
         self._note("stop in motion", ok=abs(after) < 5.0, stood_s=round(stood_s, 3), further_deg=round(after, 3))
 
     def _attempt(self, name: str, motion: Callable[[], None]) -> None:
         """One motion; what the machine refuses or does not do in time is that motion's result, and it is stopped."""
         try:
             motion()
-        except (Refused, WaitError) as why:
-            self._api.stop()
-            self._api.command("reset")
+        except (RefusedError, WaitError) as why:
+            self._client.stop()
+            self._client.reset()
             self._note(name, ok=False, why=str(why))
 
     def _arm(self) -> None:
-        self._api.command("arm")
-        wait_for("armed", lambda: self._api.status()["mode"] in ("manual", "auto"), 10.0)
-        self._api.command("manual")
+        self._client.command("arm")
+        wait_for("armed", lambda: self._status()["mode"] in ("manual", "auto"), 10.0)
+        self._client.command("manual")
 
     def _measured(self, axis: str) -> float:
-        return float(self._api.status()["axes"][axis]["measured"])
+        return float(self._status()["axes"][axis]["measured"])
 
     def _jog(self, axis: str, value: float, done: Callable[[Status], bool]) -> list[tuple[float, Status]]:
         """Jog while renewing the lease until ``done`` or time-out; what was seen on the way."""
         began_s, trace = time.monotonic(), []
-        self._api.command("jog", axis=axis, value=value, relative=True)
+        self._client.command("jog", axis=axis, value=value, relative=True)
         while time.monotonic() - began_s < STEP_TIMEOUT_S:
-            status = self._api.status()
+            status = self._status()
             trace.append((time.monotonic() - began_s, status))
             if done(status):
                 break
-            self._api.command("renew")
+            self._client.command("renew")
             time.sleep(RENEW_S / 2)
-        self._api.command("release")
+        self._client.command("release")
         return trace
 
     def _note(self, name: str, *, ok: bool, **figures: float | str) -> None:
@@ -189,14 +194,14 @@ def main() -> int:
     if os.environ.get("GRADERD_BENCH") != "1" or not sys.stdin.isatty():
         sys.stderr.write(f"bench-hw: refused. {MAY_NOT}\n")
         return 2
-    api = Api(options.socket)
+    client = Client(options.socket, name="bench-hw")
     try:
-        status = api.status()
-    except OSError as error:
-        sys.stderr.write(f"bench-hw: {options.socket}: no daemon ({error}). Start it: systemctl start graderd\n")
+        status: Status = client.get("/v1/status")
+    except NoDaemonError as error:
+        sys.stderr.write(f"bench-hw: {error}\n")
         return 2
     sys.stdout.write(f"{brief(status)}\n")
-    bench = Bench(api, input)
+    bench = Bench(client, input)
     try:
         bench.run()
     except KeyboardInterrupt:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.client
 import json
 import socket
 import subprocess
@@ -13,6 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import tomlkit
+
+from graderd.client import Client, NoDaemonError, RefusedError
 
 SOCKET: Final = Path("/run/graderd/graderd.sock")
 CONFIG: Final = Path("/etc/graderd/graderd.toml")
@@ -100,61 +101,18 @@ class Unit:
         return run("journalctl", "-u", self.name, "-n", str(lines), "--no-pager", "-o", "short-monotonic").stdout
 
 
-class Refused(Exception):  # noqa: N818  (the answer to a request, not a failure of the test)
-    """The daemon answered with an error status; ``args`` are the status and the body."""
-
-
-class Api:
-    """The HTTP interface on the unix socket."""
-
-    def __init__(self, path: Path = SOCKET) -> None:
-        self._path = path
-
-    def request(self, method: str, path: str, body: object = None, timeout_s: float = 10.0) -> Any:
-        """One request; the decoded answer.
-
-        Raises:
-            Refused: the status is 400 or above.
-            OSError: nobody serves the socket.
-        """
-        connection = http.client.HTTPConnection("localhost", timeout=timeout_s)
-        connection.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        connection.sock.settimeout(timeout_s)
-        try:
-            connection.sock.connect(str(self._path))
-            payload = None if body is None else json.dumps(body)
-            connection.request(method, path, payload, {"Content-Type": "application/json"} if payload else {})
-            response = connection.getresponse()
-            answer = json.loads(response.read() or b"null")
-        finally:
-            connection.close()
-        if response.status >= 400:
-            raise Refused(response.status, answer)
-        return answer
-
-    def status(self) -> Status:
-        """Everything at one moment."""
-        found: Status = self.request("GET", "/v1/status")
-        return found
-
-    def command(self, name: str, **arguments: object) -> Any:
-        """One command; a reset names the stop that is latched now."""
-        if name == "reset":
-            arguments = {"stop_n": self.request("GET", "/v1/status")["stop_n"], **arguments}
-        return self.request("POST", "/v1/commands", {"command": name, "client": "hil", **arguments})
-
-    def stop(self) -> Any:
-        """The stop lane."""
-        return self.request("POST", "/v1/stop", {"client": "hil", "reason": "hil"})
-
-
 class Grader:
     """graderd.service with its interface."""
 
     def __init__(self) -> None:
         self.unit = Unit("graderd.service")
-        self.api = Api()
+        self.client = Client(SOCKET, name="hil")
         self._settings: Mapping[str, object] = {}
+
+    def status(self) -> Status:
+        """Everything at one moment."""
+        found: Status = self.client.get("/v1/status")
+        return found
 
     def configure(self, changes: Mapping[str, object]) -> None:
         """Set dotted keys in the installed configuration; comments stay."""
@@ -187,8 +145,8 @@ class Grader:
     def status_or_none(self) -> Status | None:
         """The status, or None while nobody answers."""
         try:
-            return self.api.status()
-        except (OSError, http.client.HTTPException):
+            return self.status()
+        except NoDaemonError:
             return None
 
     def wait(self, what: str, check: Callable[[Status], Any], timeout_s: float = 20.0) -> Status:
@@ -220,14 +178,14 @@ class Grader:
 
         def accepted() -> bool:
             try:
-                self.api.command("arm")
-            except Refused:
+                self.client.command("arm")
+            except RefusedError:
                 return False
             return True
 
         wait_for("arming accepted", accepted, 15.0, 0.5)
         self.wait("armed", lambda s: s["mode"] in ("manual", "auto"), 15.0)
-        self.api.command(mode)
+        self.client.command(mode)
         return self.wait(mode, lambda s: s["mode"] == mode, 5.0)
 
     def jog(self, axis: str, value: float, done: Callable[[Status], Any], timeout_s: float = 30.0) -> None:
@@ -237,24 +195,24 @@ class Grader:
             WaitError: it did not get there.
         """
         until_s = time.monotonic() + timeout_s
-        self.api.command("jog", axis=axis, value=value)
-        while not done(self.api.status()):
+        self.client.command("jog", axis=axis, value=value)
+        while not done(self.status()):
             if time.monotonic() > until_s:
-                raise WaitError(f"jog {axis} {value}: not within {timeout_s:g} s; {brief(self.api.status())}")
+                raise WaitError(f"jog {axis} {value}: not within {timeout_s:g} s; {brief(self.status())}")
             time.sleep(ASK_EVERY_S)
             try:
-                self.api.command("renew")
-            except Refused:
-                self.api.command("jog", axis=axis, value=value)
-        self.api.command("release")
+                self.client.command("renew")
+            except RefusedError:
+                self.client.command("jog", axis=axis, value=value)
+        self.client.command("release")
 
     def disarm(self) -> None:
         """Back to disarmed from any mode."""
         mode = self.wait("an answer", lambda s: s["mode"], 40.0)["mode"]
         if mode == "stopped":
-            self.api.command("reset")
+            self.client.reset()
         elif mode != "disarmed":
-            self.api.command("disarm")
+            self.client.command("disarm")
         self.wait("disarmed", lambda s: s["mode"] == "disarmed", 10.0)
 
     def cli(self, *arguments: str, check: bool = True, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
@@ -370,16 +328,16 @@ class Rig:
 
 def new_pass(grader: Grader, rig: Rig, zone: str, seed: int) -> None:
     """As an operator begins a pass: blade square in manual, fresh soil in front of it, then automatic."""
-    if grader.api.status()["mode"] == "disarmed":
+    if grader.status()["mode"] == "disarmed":
         grader.arm("manual")
     else:
-        grader.api.command("manual")
+        grader.client.command("manual")
     rig.ask("scene", zone="none")
     rig.ask("reset_vehicle")
     grader.wait("pictures", lambda s: s["soil"]["age_s"] is not None)
     grader.jog("rotate", 0.0, lambda s: abs(s["axes"]["rotation"]["measured"]) <= 0.5)
     rig.ask("scene", zone=zone, seed=seed)
-    grader.api.command("auto")
+    grader.client.command("auto")
 
 
 def turn(grader: Grader, rig: Rig) -> None:

@@ -130,8 +130,8 @@ def ready(grader: Grader) -> None:
 def turning(grader: Grader, goal_deg: float) -> float:
     """Arm, jog towards the goal, return the angle while it turns."""
     grader.arm("manual")
-    start = grader.api.status()["axes"]["rotation"]["measured"]
-    grader.api.command("jog", axis="rotate", value=goal_deg)
+    start = grader.status()["axes"]["rotation"]["measured"]
+    grader.client.command("jog", axis="rotate", value=goal_deg)
     state = grader.wait("turning", lambda s: abs(s["axes"]["rotation"]["measured"] - start) > 1.0, 30.0)
     return float(state["axes"]["rotation"]["measured"])
 
@@ -193,9 +193,9 @@ def main() -> int:
         )
         found["latency_ms"] = latency_ms()
         assert found["latency_ms"] == 1, found
-        before = grader.api.status()["axes"]["rotation"]["measured"]
+        before = grader.status()["axes"]["rotation"]["measured"]
         time.sleep(3.0)
-        after = grader.api.status()["axes"]["rotation"]["measured"]
+        after = grader.status()["axes"]["rotation"]["measured"]
         assert abs(after - before) < 0.2, "it stands"
         assert before < 25.0, "it stopped on the way, for the servo's own watchdog ended the motion"
         found["stands_at_deg"] = after
@@ -221,7 +221,7 @@ def main() -> int:
         grader.disarm()
         assert grader.unit.pid == pid
         assert grader.unit.restarts_n == 0
-    sys.stdout.write(f"hil-usb: {brief(grader.api.status())}\n")
+    sys.stdout.write(f"hil-usb: {brief(grader.status())}\n")
     return 0
 
 

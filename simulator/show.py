@@ -103,6 +103,8 @@ class PanelShow:
     def event(self, event: str, **fields: Any) -> None:
         if event == "demo_finished":
             self._live.console.print(_passes_table(fields["passes"]))
+            if fields["reason"]:
+                self._live.console.print(Text(f"failed: {fields['reason']}", "red"))
             return
         told = ", ".join(f"{key} {_plain(value)}" for key, value in fields.items())
         self._events.append(f"{time.monotonic() - self._start_s:6.1f} s  {event}  {told}")

@@ -21,7 +21,7 @@ from graderd.drivers.dynamixel import Ph54Rotator
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 
 PATIENCE_S = 15.0
 """Deadline of waits in tests: long, because the machine may be busy; nothing is measured by it."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import httpx
-
+from graderd.client import AsyncClient, NoDaemonError
+from graderd.core.commands import Reply
 from graderd.core.status import Status
 from graderd.simulator.control_client import RigControl
 
@@ -25,18 +25,18 @@ class Machine:
     directory: Path
     rig: asyncio.subprocess.Process
     daemon: asyncio.subprocess.Process
-    client: httpx.AsyncClient
+    client: AsyncClient
 
     async def status(self) -> Status:
-        return Status.model_validate((await self.client.get("/v1/status")).json())
+        return await self.client.status()
 
-    async def command(self, name: str, **fields: Any) -> httpx.Response:
-        return await self.client.post("/v1/commands", json={"command": name, "client": "test", **fields})
+    async def command(self, name: str, **fields: Any) -> Reply:
+        return await self.client.command(name, **fields)
 
     async def until(self, reached: Callable[[Status], bool], timeout_s: float = READY_S) -> Status:
         async with asyncio.timeout(timeout_s):
             while True:
-                with suppress(httpx.TransportError):
+                with suppress(NoDaemonError):
                     status = await self.status()
                     if reached(status):
                         return status
@@ -47,9 +47,9 @@ class Machine:
         await self.until(lambda s: all(r.met for r in s.readiness if r.mandatory) and s.soil.frames_per_s > 0)
         async with RigControl(self.directory / "control.sock") as rig:
             await rig.request("scene", zone="even")
-        assert (await self.command("arm")).status_code == 200
+        await self.command("arm")
         await self.until(lambda s: s.mode == "manual")
-        assert (await self.command("auto")).status_code == 200
+        await self.command("auto")
         await self.until(lambda s: (s.axes["rotation"].measured or 0.0) > 8.0)
 
 
@@ -74,8 +74,7 @@ async def machine(directory: Path, more_config: str = "") -> AsyncIterator[Machi
         *(sys.executable, "-m", "graderd", "run"),
         *("--config", str(directory / "graderd.toml"), "--rig-dir", str(directory)),
     )
-    transport = httpx.AsyncHTTPTransport(uds=str(socket_path))
-    async with httpx.AsyncClient(transport=transport, base_url="http://graderd", timeout=10.0) as client:
+    async with AsyncClient(socket_path, name="test", timeout_s=10.0) as client:
         whole = Machine(directory, rig, daemon, client)
         try:
             yield whole

@@ -19,7 +19,7 @@ from graderd.drivers.dynamixel.connection import Found, ServoLink, condition_of
 from graderd.drivers.dynamixel.device import EXTENDED_MODE, POSITION_MODE, Difference
 from graderd.drivers.dynamixel.observer import ServoObserver
 from graderd.drivers.dynamixel.serial_port import ListPorts, system_ports
-from graderd.drivers.dynamixel.servo_task import DEVICE, LINK_FAULTS, CommandSlot, ServoTask
+from graderd.drivers.dynamixel.servo_task import DEVICE, FIELDS, LINK_FAULTS, CommandSlot, ServoTask
 from graderd.drivers.dynamixel.states import Event
 from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.clock import Clock, SystemClock
@@ -176,7 +176,7 @@ class Ph54Rotator:
                 async with asyncio.timeout(_CLOSE_S):
                     await self._keeper.power_down(off=self.settings.torque_at_exit == "off", leaving=True)
             except (DeviceError, TimeoutError) as e:
-                log.error("%s: could not be made safe at exit (%s); its bus watchdog stops it", DEVICE, e)
+                log.error("%s: could not be made safe at exit (%s); its bus watchdog stops it", DEVICE, e, extra=FIELDS)
         await self._keeper.stop()
 
     async def reboot(self) -> None:

@@ -25,6 +25,7 @@ from graderd.hal.settings import Ph54Settings
 log = logging.getLogger(__name__)
 
 DEVICE = "rotation"
+FIELDS = {"device": DEVICE}
 
 
 class CommandSlot:
@@ -319,7 +320,7 @@ class ServoTask:
                 if self._command.hold_wanted:
                     await self._tolerant(self._hold(device))
             except DeviceRefusedError as e:
-                log.warning("%s: %s", DEVICE, e)
+                log.warning("%s: %s", DEVICE, e, extra=FIELDS)
                 self._command.forget(self._command.sent_counts)
                 if off:
                     break
@@ -331,7 +332,7 @@ class ServoTask:
             if began is None and not self._command.hold_wanted:
                 began = angle
             if off and began is not None and angle is not None and abs(angle.value - began.value) > _RUNAWAY_DEG:
-                log.warning("%s: does not obey the hold: torque off without waiting for rest", DEVICE)
+                log.warning("%s: does not obey the hold: torque off without waiting for rest", DEVICE, extra=FIELDS)
                 break
 
     # -- the servo's own task ---------------------------------------------------------------------------------
@@ -340,7 +341,7 @@ class ServoTask:
         """The owner of the wire must not die while the rotator is open: start it again."""
         if task is self._task and self.lifecycle is not Lifecycle.CLOSED:
             cause = "was cancelled" if task.cancelled() else f"failed: {task.exception()!r}"
-            log.error("%s: the servo task %s; starting it again", DEVICE, cause)
+            log.error("%s: the servo task %s; starting it again", DEVICE, cause, extra=FIELDS)
             self._fail(DeviceLostError(DEVICE, f"the servo task {cause}"))
             self.start()
 
@@ -354,13 +355,14 @@ class ServoTask:
                         await self.connect()
                         self.note(Event.FOUND)
                     self._link.happened["reconnects_n"] += 1
-                    log.info("%s: servo found at %s", DEVICE, self._link.bus.port if self._link.bus else "?")
+                    port = self._link.bus.port if self._link.bus else "?"
+                    log.info("%s: servo found at %s", DEVICE, port, extra=FIELDS)
                 pause_s = _RECONNECT_FIRST_S
                 await self._serve()
             except DeviceError as e:
                 self._fail(e)
             except Exception as e:  # a bug in here must not end the search for the servo
-                log.exception("%s: unexpected error in the servo task", DEVICE)
+                log.exception("%s: unexpected error in the servo task", DEVICE, extra=FIELDS)
                 self._fail(DeviceLostError(DEVICE, f"internal error {e!r}"))
             await asyncio.sleep(pause_s)
             pause_s = min(_RECONNECT_MOST_S, 2 * pause_s)
@@ -369,8 +371,9 @@ class ServoTask:
         condition, faults = condition_of(error), self._observer.faults
         if condition == "no_reply" and self._observer.damaged_lately():
             condition = "corrupt_replies"
-        if faults.set(condition, error.cause, self._clock.now_s()):
-            log.warning("%s: %s", condition, error)
+        faults.set(condition, error.cause, self._clock.now_s())
+        # At every attempt: the log repeats it ever more rarely.
+        log.warning("%s: %s", condition, error, extra={**FIELDS, "fault": f"{DEVICE}.{condition}"})
         faults.clear(*(c for c in LINK_FAULTS if c != condition), *SUPPLY_FAULTS)
         self.note(Event.LOST)
         self._command.forget()
@@ -516,7 +519,7 @@ class ServoTask:
 
     async def _on_refusal(self, device: Ph54Device, error: DeviceRefusedError) -> None:
         """A goal was refused: the watchdog has tripped, or the servo is not as we left it. Never go on blindly."""
-        log.warning("%s: %s", DEVICE, error)
+        log.warning("%s: %s", DEVICE, error, extra=FIELDS)
         was_active = self.lifecycle is Lifecycle.ACTIVE
         self.note(Event.DISARMED)
         if isinstance(error, ServoRefusedError) and error.error == StatusError.DATA_RANGE:

@@ -6,7 +6,7 @@ import asyncio
 import math
 from typing import Final
 
-from graderd.drivers.electrak.codec import Control, ElectrakCodec
+from graderd.drivers.electrak.codec import SELECTABLE_ADDRESSES, Control, ElectrakCodec
 from graderd.drivers.electrak.feedback import (
     FAILING,
     INFORMATIVE,
@@ -41,8 +41,6 @@ _WAKING_S: Final = 0.5
 """A claim so soon after our first message of a while is that of a unit which fell asleep meanwhile."""
 _CLOSE_REPEATS_N: Final = 3
 _CONTROL_PRIORITY: Final = 6
-SELECTABLE_ADDRESSES: Final = range(19, 43)
-"""An Electrak's first address is 19 (HD) or 27 (MD), to which its select wires add."""
 
 
 class ElectrakActuator:
@@ -80,6 +78,7 @@ class ElectrakActuator:
         self._resumed_at_s = -math.inf
         self._sent: Reading[float] | None = None
         self._sent_enabled = False
+        self._may_move = False
         self._overload = OverloadPolicy(settings.overload_retries_n)
         self._overload_detail = ""
         self._claimed_name: int | None = None
@@ -248,13 +247,14 @@ class ElectrakActuator:
             self._resumed_at_s = now_s
         self._control_at_s = now_s
         self._watch(now_s)
-        control = self._next_control(now_s)
-        self._sent_enabled = control.motion_enable
-        if control.motion_enable:
-            self._sent = Reading(control.target_mm, now_s)
-        self._counters["control_n"] += 1
-        can_id = make_id(_CONTROL_PRIORITY, Pgn.PROPRIETARY_A, source, self.address)
-        return Frame(can_id, self._codec.encode_control(control))
+        return self._control_message(self._next_control(now_s), source, now_s)
+
+    def stop_frame(self, source: int, now_s: float) -> Frame | None:
+        """Motion disabled; None where the actuator was told so and is seen at rest since."""
+        if not self._may_move:
+            return None
+        here_mm = self._track.feedback.position_mm if self._track.feedback else 0.0
+        return self._control_message(self._planner.disabled(here_mm), source, now_s)
 
     def on_feedback(self, data: bytes, now_s: float) -> None:
         """A feedback message from this address."""
@@ -276,6 +276,7 @@ class ElectrakActuator:
         self._track.take(feedback, now_s)
         self._thermal.update(feedback.current_a, now_s)
         self._planner.on_feedback(self._track.motion(now_s))
+        self._may_move = feedback.moving or self._sent_enabled
         if self._link.address is None:
             # Still awake from before, and about to sleep: what is heard while we may not speak is no answer to us.
             self._track.good_n = 0
@@ -308,6 +309,14 @@ class ElectrakActuator:
         self._fail()
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _control_message(self, control: Control, source: int, now_s: float) -> Frame:
+        self._sent_enabled = control.motion_enable
+        if control.motion_enable:
+            self._sent, self._may_move = Reading(control.target_mm, now_s), True
+        self._counters["control_n"] += 1
+        can_id = make_id(_CONTROL_PRIORITY, Pgn.PROPRIETARY_A, source, self.address)
+        return Frame(can_id, self._codec.encode_control(control))
 
     def _next_control(self, now_s: float) -> Control:
         feedback = self._track.feedback
@@ -375,7 +384,7 @@ class ElectrakActuator:
         self._faults.clear_all()
         self._track.forget()
         self._heard.clear()
-        self._sent, self._sent_enabled = None, False
+        self._sent, self._sent_enabled, self._may_move = None, False, False
         self._overload.rearm()
         self._claimed_name = None
 

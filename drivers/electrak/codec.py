@@ -23,6 +23,10 @@ FACTORY_FILL: Final = 0
 MAX_RAW_POSITION: Final = 10_000
 """1000.0 mm: beyond it no Electrak exists, so the field is no position."""
 
+SELECTABLE_ADDRESSES: Final = range(19, 43)
+"""An Electrak's first address is 19 (HD) or 27 (MD), to which its select wires add; a third family with the same
+messages was seen from 35 on."""
+
 FLAGS: Final = ("overload", "backdrive", "parameter", "saturation", "fatal")
 """One-bit flags of the feedback message; names as in the telemetry contract."""
 

@@ -1,6 +1,6 @@
 """``python -m graderd.drivers.electrak.dump``: the bus in words, live or from a log.
 
-One line or one JSON object a frame.
+One line or one JSON object a frame, and each told as what it is: data, remote, error or CAN FD.
 
 A serial adapter has one reader: while the daemon has it, the frames come from the daemon (``graderd can dump``).
 """
@@ -10,39 +10,39 @@ from __future__ import annotations
 import argparse
 import functools
 import json
-import re
 import select
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
+from enum import IntEnum
 from pathlib import Path
-from typing import Any, Final, TextIO, TypedDict
+from typing import Any, Final, Literal, TextIO, TypedDict
 
 import can
 from cantools.database.can import Message as DbcMessage
 from cantools.database.namedsignalvalue import NamedSignalValue
 
-from graderd.drivers.electrak.codec import load_database
+from graderd.drivers.electrak.codec import SELECTABLE_ADDRESSES, load_database
 from graderd.drivers.j1939 import dm1
-from graderd.drivers.j1939.bus_health import BusEvent
-from graderd.drivers.j1939.can_port import PortLostError, open_port
-from graderd.drivers.j1939.ids import Frame, Pgn, destination_of, pgn_name, pgn_of, source_of
+from graderd.drivers.j1939.bus_health import ERROR_CLASSES, event_of
+from graderd.drivers.j1939.can_logs import read_candump, read_file
+from graderd.drivers.j1939.can_port import READY_S, PortLostError, open_port
+from graderd.drivers.j1939.ids import Pgn, destination_of, pgn_name, pgn_of, source_of
 from graderd.drivers.j1939.name import Name
-from graderd.drivers.j1939.transport import Message, Transport
-from graderd.hal.clock import SystemClock
+from graderd.drivers.j1939.node import Ack
+from graderd.drivers.j1939.transport import Control, Listener, Message
 from graderd.hal.errors import DeviceError, DeviceLostError, ProtocolError
 from graderd.hal.settings import CanSettings
+from graderd.hal.text import printable
 
-_THOMSON_ADDRESSES: Final = range(19, 43)
-"""HD from 19, MD from 27, and a third family seen from 35 on with the same messages."""
 _MD_ADDRESSES: Final = range(27, 35)
-_TP_CONTROLS: Final = {16: "rts", 17: "cts", 19: "end_of_message", 32: "bam", 255: "abort"}
-_ACKS: Final = {0: "positive", 1: "negative", 2: "access_denied", 3: "cannot_respond"}
+Kind = Literal["data", "remote", "error", "fd"]
 
 
 class DecodedFrame(TypedDict):
     """One frame. Signal names carry their units; ``can_id`` is a number, ``data`` hexadecimal."""
 
     t_s: float
+    kind: Kind
     can_id: int
     pgn: int | None
     source: int | None
@@ -61,60 +61,79 @@ class FrameDecoder:
     """Decodes frame after frame; it remembers transport protocol sessions and puts long messages together."""
 
     def __init__(self) -> None:
-        self._sessions: dict[tuple[int, int], Transport] = {}
+        self._listener = Listener()
 
-    def decode(self, frame: Frame, t_s: float) -> DecodedFrame:
+    def decode(self, frame: can.Message) -> DecodedFrame:
         """One frame in words; never raises for whatever the bus carries."""
+        can_id, data, t_s = frame.arbitration_id, bytes(frame.data), frame.timestamp
         decoded = DecodedFrame(
             t_s=round(t_s, 6),
-            can_id=frame.can_id,
+            kind=kind_of(frame),
+            can_id=can_id,
             pgn=None,
             source=None,
             destination=None,
             name="",
-            data=frame.data.hex().upper(),
+            data=data.hex().upper(),
             signals={},
         )
-        if not frame.extended:
+        if decoded["kind"] == "error":
+            event = event_of(can_id, data)
+            decoded["name"] = "error frame"
+            decoded["signals"] = {"errors": [name for n, name in enumerate(ERROR_CLASSES) if can_id >> n & 1]}
+            decoded["signals"] |= {"state": event.value} if event else {}
             return decoded
-        pgn, source, destination = pgn_of(frame.can_id), source_of(frame.can_id), destination_of(frame.can_id)
+        if decoded["kind"] == "fd":
+            decoded["name"] = "CAN FD frame"
+            return decoded
+        if not frame.is_extended_id:
+            decoded["name"] = "remote request" if decoded["kind"] == "remote" else ""
+            return decoded
+        pgn, source, destination = pgn_of(can_id), source_of(can_id), destination_of(can_id)
         decoded["pgn"], decoded["source"], decoded["destination"] = pgn, source, destination
         decoded["name"] = pgn_name(pgn)
-        if pgn == Pgn.PROPRIETARY_A and destination in _THOMSON_ADDRESSES:
+        if decoded["kind"] == "remote":
+            decoded["name"] = f"remote request for {pgn_name(pgn)}"
+        elif pgn == Pgn.PROPRIETARY_A and destination in SELECTABLE_ADDRESSES:
             decoded["name"] = "ACM"
-            decoded["signals"] = _electrak("ACM", destination, frame.data)
-        elif pgn == Pgn.PROPRIETARY_A2 and source in _THOMSON_ADDRESSES:
+            decoded["signals"] = _electrak("ACM", destination, data)
+        elif pgn == Pgn.PROPRIETARY_A2 and source in SELECTABLE_ADDRESSES:
             decoded["name"] = "AFM"
-            decoded["signals"] = _electrak("AFM", source, frame.data)
+            decoded["signals"] = _electrak("AFM", source, data)
         elif pgn == Pgn.ADDRESS_CLAIMED and source == 0xFE:
             decoded["name"] = "cannot_claim"
-            decoded["signals"] = _standard(Message(pgn, source, destination, frame.data))
+            decoded["signals"] = _standard(Message(pgn, source, destination, data))
         elif pgn in (Pgn.TP_CONNECTION, Pgn.TP_DATA):
-            decoded["signals"] = self._transport(pgn, source, destination, frame.data, t_s)
+            decoded["signals"] = self._transport(pgn, source, destination, data, t_s)
         else:
-            decoded["signals"] = _standard(Message(pgn, source, destination, frame.data))
+            decoded["signals"] = _standard(Message(pgn, source, destination, data))
         return decoded
 
     def _transport(self, pgn: int, source: int, destination: int, data: bytes, t_s: float) -> dict[str, Any]:
+        message = self._listener.on_frame(pgn, source, destination, data, t_s)
         if len(data) != 8:
             return {}
-        key = (source, destination)
         if pgn == Pgn.TP_CONNECTION:
             about = int.from_bytes(data[5:8], "little")
-            if data[0] in (16, 32):
-                session = Transport()
-                session.address = destination  # a listener: what it would answer is thrown away
-                session.on_connection(source, destination, data, t_s)
-                if len(self._sessions) < 64 or key in self._sessions:
-                    self._sessions[key] = session
-            return {"control": _TP_CONTROLS.get(data[0], data[0]), "about_pgn": about, "about": pgn_name(about)}
+            return {"control": _word(Control, data[0]), "about_pgn": about, "about": pgn_name(about)}
         signals: dict[str, Any] = {"packet": data[0]}
-        if key in self._sessions:
-            _, message = self._sessions[key].on_data(source, destination, data, t_s)
-            if message is not None:
-                del self._sessions[key]
-                signals |= {"message": pgn_name(message.pgn), "message_pgn": message.pgn, **_standard(message)}
+        if message is not None:
+            signals |= {"message": pgn_name(message.pgn), "message_pgn": message.pgn, **_standard(message)}
         return signals
+
+
+def kind_of(frame: can.Message) -> Kind:
+    """What kind of frame it is."""
+    if frame.is_error_frame:
+        return "error"
+    if frame.is_remote_frame:
+        return "remote"
+    return "fd" if frame.is_fd else "data"
+
+
+def _word(words: type[IntEnum], number: int) -> str | int:
+    """The number's name in a table, or the number."""
+    return words(number).name.lower() if number in words._value2member_map_ else number
 
 
 def _electrak(name: str, address: int, data: bytes) -> dict[str, Any]:
@@ -143,7 +162,7 @@ def _standard(message: Message) -> dict[str, Any]:
                 return {"requested_pgn": about, "requested": pgn_name(about)}
             case Pgn.ACKNOWLEDGEMENT if len(data) == 8:
                 about = int.from_bytes(data[5:8], "little")
-                return {"control": _ACKS.get(data[0], data[0]), "about_pgn": about, "address": data[4]}
+                return {"control": _word(Ack, data[0]), "about_pgn": about, "address": data[4]}
             case Pgn.DM1:
                 lamps, dtcs = dm1.decode(data)
                 codes = [{"spn": d.spn, "fmi": d.fmi, "occurrences": d.occurrences_n} for d in dtcs]
@@ -161,93 +180,7 @@ def _standard(message: Message) -> dict[str, Any]:
     return {}
 
 
-# candump -l / -L:  (1622749162.123456) can0 18EF1300#DC05191500000000
-_COMPACT: Final = re.compile(
-    r"^\s*(?:\((?P<t>\d+(?:\.\d+)?)\)\s+)?\S+\s+(?P<id>[0-9A-Fa-f]{3,8})#(?P<data>[0-9A-Fa-f]*)"
-)
-# candump, also with -t and -x:  (0.105000)  can0  TX - -  18EF1300   [8]  DC 05 19 15 00 00 00 00
-_COLUMNS: Final = re.compile(
-    r"^\s*(?:\((?P<t>[^)]*)\)\s+)?\S+\s+(?:[RT]X\s+\S+\s+\S+\s+)?(?P<id>[0-9A-Fa-f]{3,8})\s+\[(?P<n>\d)\]\s*"
-    r"(?P<data>(?:[0-9A-Fa-f]{2}\s?)*)"
-)
-
-Timed = tuple[float, Frame]
-
-
-def parse_candump_line(line: str) -> Timed | None:
-    """One line of candump text (any of its formats), or None where it is no data frame."""
-    match = _COMPACT.match(line) or _COLUMNS.match(line)
-    if match is None:
-        return None
-    digits = match["id"]
-    data = re.sub(r"\s", "", match["data"])
-    if len(data) % 2 or len(data) > 16:
-        return None
-    try:
-        t_s = float(match["t"] or 0.0)
-    except ValueError:  # candump -tA writes a date
-        t_s = 0.0
-    return t_s, Frame(int(digits, 16) & 0x1FFFFFFF, bytes.fromhex(data), len(digits) > 3)
-
-
-def parse_candump(lines: Iterable[str]) -> Iterator[Timed]:
-    """The frames of many lines; what is none is left out."""
-    for line in lines:
-        timed = parse_candump_line(line)
-        if timed is not None:
-            yield timed
-
-
-def candump_line(frame: Frame, t_s: float, channel: str = "can0") -> str:
-    """One frame as ``candump -L`` writes it."""
-    return f"({t_s:.6f}) {channel} {frame.can_id:0{8 if frame.extended else 3}X}#{frame.data.hex().upper()}"
-
-
-_READERS: Final[dict[str, tuple[Callable[[Any], Iterable[can.Message]], str]]] = {
-    ".asc": (can.ASCReader, "r"),
-    ".blf": (can.BLFReader, "rb"),
-    ".mf4": (can.MF4Reader, "rb"),
-    ".trc": (can.TRCReader, "r"),
-    ".csv": (can.CSVReader, "r"),
-}
-"""Log formats read by python-can, by file name; every other file is taken for candump text."""
-
-
-def read_file(path: Path) -> Iterator[Timed]:
-    """Frames of a candump, ASC, BLF or MF4 log with their times in seconds.
-
-    Raises:
-        ProtocolError: the file cannot be read as such a log.
-    """
-    if path.suffix.lower() not in _READERS:
-        yield from _read_candump(path)
-        return
-    make_reader, mode = _READERS[path.suffix.lower()]
-    try:
-        with path.open(mode) as file:  # opened here, because some readers leave a damaged file open
-            for message in make_reader(file):
-                if not (message.is_error_frame or message.is_remote_frame):
-                    yield message.timestamp, Frame(message.arbitration_id, bytes(message.data), message.is_extended_id)
-    except OSError:
-        raise
-    except Exception as error:  # each format's reader has its own ways to fail on a damaged file
-        raise ProtocolError(
-            str(path), f"cannot be read: {error}", "Is it a log of this format, and complete?"
-        ) from error
-
-
-def _read_candump(path: Path) -> Iterator[Timed]:
-    found = False
-    with path.open(encoding="ascii", errors="replace") as lines:
-        for timed in parse_candump(lines):
-            found = True
-            yield timed
-    if not found:
-        formats = "candump text, or .asc, .blf, .mf4"
-        raise ProtocolError(str(path), "holds no CAN frame in candump's form", f"Known formats: {formats}")
-
-
-def read_live(channel: str) -> Iterator[Timed]:
+def read_live(channel: str) -> Iterator[can.Message]:
     """Frames of a live bus for ever: a serial port or link is opened as slcan, anything else as SocketCAN.
 
     Raises:
@@ -256,15 +189,13 @@ def read_live(channel: str) -> Iterator[Timed]:
     """
     is_port = "/" in channel
     settings = CanSettings(interface="slcan" if is_port else "socketcan", channel=channel)
-    clock = SystemClock()
-    port = open_port(settings)
+    port = open_port(settings, fd=True)
     try:
+        port.wait_ready(READY_S)
         while True:
             if not port.pending:
                 select.select([port.fileno()], [], [])
-            for item in port.read():
-                if not isinstance(item, BusEvent):
-                    yield clock.now_s(), item
+            yield from port.read_messages()
     except PortLostError as error:
         raise DeviceLostError(f"CAN {channel}", f"{error.condition}: {error.detail}") from error
     finally:
@@ -274,18 +205,22 @@ def read_live(channel: str) -> Iterator[Timed]:
 def text_of(decoded: DecodedFrame) -> str:
     """One line for people."""
     head = f"{decoded['t_s']:17.6f}  {decoded['can_id']:08X}"
-    if decoded["pgn"] is None:
-        return f"{head}  {decoded['data']}"
-    route = f"{decoded['source']:3d} > {decoded['destination']:3d}"
     signals = " ".join(f"{key}={value}" for key, value in decoded["signals"].items())
-    return f"{head}  {route}  {decoded['name']:<18} {signals or decoded['data']}"
+    if decoded["pgn"] is None:
+        return printable(
+            f"{head}  {decoded['name']:<18} {signals or decoded['data']}"
+            if decoded["name"]
+            else f"{head}  {decoded['data']}"
+        )
+    route = f"{decoded['source']:3d} > {decoded['destination']:3d}"
+    return printable(f"{head}  {route}  {decoded['name']:<18} {signals or decoded['data']}")  # a unit's own words
 
 
-def dump(frames: Iterator[Timed], out: TextIO, *, as_json: bool) -> None:
+def dump(frames: Iterable[can.Message], out: TextIO, *, as_json: bool) -> None:
     """Write every frame, decoded."""
     decoder = FrameDecoder()
-    for t_s, frame in frames:
-        decoded = decoder.decode(frame, t_s)
+    for frame in frames:
+        decoded = decoder.decode(frame)
         out.write((json.dumps(decoded) if as_json else text_of(decoded)) + "\n")
         out.flush()
 
@@ -294,7 +229,7 @@ def main(argv: list[str] | None = None) -> int:
     """Exit status 1 where the source cannot be read."""
     parser = argparse.ArgumentParser(
         prog="python -m graderd.drivers.electrak.dump",
-        description="Print a CAN bus decoded, live or from a candump, ASC, BLF or MF4 file.",
+        description="Print a CAN bus decoded, live or from a candump, ASC, BLF, MF4, TRC or CSV file (also .gz).",
         epilog="examples: dump can0 | dump /dev/graderd/can | dump trip.log --json | candump -L can0 | dump -",
     )
     parser.add_argument(
@@ -308,7 +243,8 @@ def main(argv: list[str] | None = None) -> int:
         if not is_file and path.suffix and not path.exists():
             raise ProtocolError(str(path), "no such file")
         if arguments.source == "-":
-            frames = parse_candump(sys.stdin)
+            text = open(sys.stdin.fileno(), encoding="utf-8", errors="replace", closefd=False)  # noqa: SIM115
+            frames = read_candump(text, "standard input")
         else:
             frames = read_file(path) if is_file else read_live(arguments.source)
         dump(frames, sys.stdout, as_json=arguments.json)

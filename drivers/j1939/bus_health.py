@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 from enum import StrEnum
 from typing import Final
 
@@ -17,6 +18,8 @@ class BusEvent(StrEnum):
     ERROR_PASSIVE = "error_passive"
     BUS_OFF = "bus_off"
     QUEUE_OVERRUN = "queue_overrun"
+    REFUSED = "refused"
+    """The adapter answered NACK to what it was given: a frame that did not leave, mostly."""
 
 
 def event_of(class_bits: int, data: bytes) -> BusEvent | None:
@@ -35,8 +38,36 @@ def event_of(class_bits: int, data: bytes) -> BusEvent | None:
     return None
 
 
+ERROR_FRAMES: Final[dict[BusEvent, tuple[int, bytes]]] = {
+    BusEvent.BUS_OFF: (0x40, bytes(8)),
+    BusEvent.ERROR_PASSIVE: (0x04, bytes((0, 0x30, 0, 0, 0, 0, 128, 128))),
+    BusEvent.ERROR_ACTIVE: (0x04, bytes((0, 0x40, 0, 0, 0, 0, 0, 0))),
+    BusEvent.QUEUE_OVERRUN: (0x04, bytes((0, 0x01, 0, 0, 0, 0, 0, 0))),
+    BusEvent.REFUSED: (0x01, bytes(8)),
+}
+"""Events as error frames of the Linux kernel: class bits and data. One that was refused is a transmit timeout."""
+
+ERROR_CLASSES: Final = (
+    "transmit_timeout",
+    "arbitration_lost",
+    "controller",
+    "protocol_violation",
+    "transceiver",
+    "no_acknowledgement",
+    "bus_off",
+    "bus_error",
+    "restarted",
+    "error_counters",
+)
+"""What the bits of an error frame's identifier say, from the lowest on."""
+
 FLOOD_HZ: Final = 1200.0
 """Frames a second beyond which the bus counts as flooded: about 75 % of what 250 kbit/s can carry."""
+REFUSED_N: Final = 5
+"""NACKs of the adapter within a second that are a fault. A single one is a lost frame, and is counted."""
+_REFUSED_WINDOW_S: Final = 1.0
+ADDRESS_LOST_S: Final = 0.28
+"""An address that was lost and not replaced for longer is a fault. A new claim takes 0.25 s and a poll of 0.02 s."""
 _OVERRUN_SHOWN_S: Final = 2.0
 _WINDOW_S: Final = 0.5
 _LOST: Final = ("interface_down", "unplugged")
@@ -49,6 +80,7 @@ class BusHealth:
         self._faults = PresentFaults("can")
         self._window_start_s = 0.0
         self._window_n = 0
+        self._refused_s: collections.deque[float] = collections.deque(maxlen=REFUSED_N)
 
     def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """Conditions present now."""
@@ -84,6 +116,11 @@ class BusHealth:
                 self._faults.clear("bus_off", "error_passive")
             case BusEvent.QUEUE_OVERRUN:
                 self._faults.tell("queue_overrun", "received frames were lost", now_s, _OVERRUN_SHOWN_S)
+            case BusEvent.REFUSED:
+                self._refused_s.append(now_s)
+                if len(self._refused_s) == REFUSED_N and now_s - self._refused_s[0] < _REFUSED_WINDOW_S:
+                    detail = f"it answered NACK {REFUSED_N} times within a second"
+                    self._faults.tell("adapter_refuses", detail, now_s, _REFUSED_WINDOW_S)
 
     def on_transmit_full(self, detail: str, now_s: float) -> None:
         """The transmit queue was full; after a bus-off that is only its consequence."""
@@ -100,15 +137,15 @@ class BusHealth:
         self._faults.keep("flood", rate_hz > FLOOD_HZ, f"{rate_hz:.0f} frames a second", now_s)
         self._window_start_s, self._window_n = now_s, 0
 
-    def watch_claim(self, claimer: AddressClaimer, now_s: float) -> None:
-        """Turn the state of the address claim into conditions."""
+    def watch_claim(self, claimer: AddressClaimer, lost_for_s: float, now_s: float) -> None:
+        """Turn the state of the address claim into conditions; ``lost_for_s``: an address lost and not replaced yet."""
         address = claimer.wanted
-        lost = claimer.state is ClaimState.CANNOT_CLAIM
+        none_free = claimer.state is ClaimState.CANNOT_CLAIM
         for condition, is_present, detail in (
             (
                 "cannot_claim",
-                lost,
-                f"address {address} is taken and no other is free",
+                none_free or lost_for_s > ADDRESS_LOST_S,
+                f"address {address} is taken" + (" and no other is free" if none_free else " and so is the next"),
             ),
             ("claim_storm", claimer.storming(now_s), f"another node claims address {address} without end"),
             (

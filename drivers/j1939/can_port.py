@@ -14,14 +14,13 @@ import os
 import select
 import socket
 import struct
-import threading
 from pathlib import Path
 from typing import Final, Literal
 
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from graderd.drivers.j1939.bus_health import BusEvent, event_of
+from graderd.drivers.j1939.bus_health import ERROR_FRAMES, BusEvent, event_of
 from graderd.drivers.j1939.ids import Frame
 from graderd.drivers.j1939.slcan_bus import QuietSlcanBus
 from graderd.hal.errors import DeviceMissingError
@@ -79,22 +78,36 @@ class BusPort:
         """Readable when frames wait or the port is lost."""
         return self._fd
 
+    def wait_ready(self, timeout_s: float) -> bool:  # noqa: ARG002  (only an adapter has to be waited for)
+        """Block until frames can be sent; False where that is not known after ``timeout_s``.
+
+        Raises:
+            PortLostError: the interface or adapter is gone.
+        """
+        return True
+
     def read(self) -> list[Frame | BusEvent]:
         """Some of the frames and events that wait, without blocking; see :attr:`pending`.
 
         Raises:
             PortLostError: the interface or adapter is gone.
         """
+        return [item for message in self.read_messages() if (item := from_message(message)) is not None]
+
+    def read_messages(self) -> list[can.Message]:
+        """As :meth:`read`, and everything as python-can tells it.
+
+        Raises:
+            PortLostError: the interface or adapter is gone.
+        """
         if self._bridge is not None:
             return self._bridge.read()
-        out: list[Frame | BusEvent] = []
+        out: list[can.Message] = []
         try:
             for _ in range(_READ_N):
                 message = self.bus.recv(0)
                 if message is not None:
-                    item = from_message(message)
-                    if item is not None:
-                        out.append(item)
+                    out.append(message)
                 elif not self._more():
                     break
         except (can.CanError, OSError) as error:
@@ -198,8 +211,15 @@ class SlcanPort(BusPort):
         super().__init__(bus)
         self._slcan = bus
 
+    def wait_ready(self, timeout_s: float) -> bool:
+        """As :meth:`BusPort.wait_ready`: until the adapter has opened its channel."""
+        try:
+            return self._slcan.wait_open(timeout_s)
+        except can.CanError as error:
+            raise lost_from(error) from error
+
     def read(self) -> list[Frame | BusEvent]:
-        """As :meth:`BusPort.read`, with the adapter's state lines as events."""
+        """As :meth:`BusPort.read`, with the adapter's state lines and NACKs as events."""
         out = super().read()
         while self._slcan.events:
             out.append(self._slcan.events.popleft())
@@ -215,16 +235,22 @@ class SlcanPort(BusPort):
 
 
 def from_message(message: can.Message) -> Frame | BusEvent | None:
-    """A python-can message as a frame or event; None for remote frames and error frames without news."""
+    """A python-can message as a frame or event; None for remote and FD frames, and error frames without news."""
     if message.is_error_frame:
         return event_of(message.arbitration_id, bytes(message.data))
-    if message.is_remote_frame:
+    if message.is_remote_frame or message.is_fd:  # J1939 knows neither
         return None
     return Frame(message.arbitration_id, bytes(message.data), message.is_extended_id)
 
 
-def open_port(settings: CanSettings) -> BusPort:
-    """Open the bus of the settings. May take some milliseconds; call it off the event loop.
+READY_S: Final = 2.5
+"""A board that resets when its port is opened takes one to two seconds to boot."""
+
+
+def open_port(settings: CanSettings, *, fd: bool = False) -> BusPort:
+    """Open the bus of the settings; where it is an adapter that boots first, see :meth:`BusPort.wait_ready`.
+
+    May take some milliseconds; call it off the event loop. ``fd``: hear CAN FD frames too, by ``read_messages``.
 
     Raises:
         DeviceMissingError: no such interface or port, it is down, or this kernel has no CAN.
@@ -235,7 +261,7 @@ def open_port(settings: CanSettings) -> BusPort:
     try:
         if settings.interface == "socketcan":
             _check_interface(where, settings.channel)
-            return SocketCanPort(SocketcanBus(channel=settings.channel))
+            return SocketCanPort(SocketcanBus(channel=settings.channel, fd=fd))
         return SlcanPort(QuietSlcanBus(settings.channel, settings.bitrate_n))
     except (can.CanError, OSError, ValueError) as error:
         remedy = "Is the adapter plugged in, and may this user open it (group dialout)?"
@@ -258,56 +284,47 @@ def _check_interface(where: str, channel: str) -> None:
         raise DeviceMissingError(where, "the interface is down", f"ip link set {channel} up type can bitrate 250000")
 
 
-class _Bridge:
-    """Carries the frames of a bus without a file descriptor from a thread to a pipe."""
+class _Bridge(can.Listener):
+    """Carries the messages of a bus without a file descriptor from python-can's thread to a pipe."""
 
     def __init__(self, bus: can.BusABC) -> None:
-        self._bus = bus
-        self._items: collections.deque[Frame | BusEvent] = collections.deque(maxlen=_BRIDGE_N)
+        self._messages: collections.deque[can.Message] = collections.deque(maxlen=_BRIDGE_N)
         self._error: BaseException | None = None
         self._read_fd, self._write_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="can-bridge", daemon=True)
-        self._thread.start()
+        self._notifier = can.Notifier(bus, [self], timeout=0.05)
 
     def fileno(self) -> int:
         return self._read_fd
 
-    def read(self) -> list[Frame | BusEvent]:
+    def read(self) -> list[can.Message]:
         with contextlib.suppress(BlockingIOError):
             os.read(self._read_fd, 4096)
-        out: list[Frame | BusEvent] = []
-        while self._items and len(out) < _READ_N:
-            out.append(self._items.popleft())
-        if self._items:
+        out: list[can.Message] = []
+        while self._messages and len(out) < _READ_N:
+            out.append(self._messages.popleft())
+        if self._messages:
             self._wake()
         elif self._error is not None and not out:
             raise lost_from(self._error) from self._error
         return out
 
     def close(self) -> None:
-        self._closed.set()
-        self._thread.join(timeout=1.0)
+        self._notifier.stop(timeout=1.0)
         for fd in (self._read_fd, self._write_fd):
             with contextlib.suppress(OSError):
                 os.close(fd)
 
+    def on_message_received(self, msg: can.Message) -> None:
+        if len(self._messages) == _BRIDGE_N:
+            class_bits, data = ERROR_FRAMES[BusEvent.QUEUE_OVERRUN]
+            msg = can.Message(arbitration_id=class_bits, data=data, is_error_frame=True)
+        self._messages.append(msg)
+        self._wake()
+
+    def on_error(self, exc: Exception) -> None:
+        self._error = exc  # whatever ended the thread is raised to the reader, never lost with it
+        self._wake()
+
     def _wake(self) -> None:
         with contextlib.suppress(BlockingIOError, OSError):
             os.write(self._write_fd, b"\0")
-
-    def _run(self) -> None:
-        try:
-            while not self._closed.is_set():
-                message = self._bus.recv(0.05)
-                if message is None:
-                    continue
-                item = from_message(message)
-                if item is not None:
-                    if len(self._items) == _BRIDGE_N:
-                        item = BusEvent.QUEUE_OVERRUN
-                    self._items.append(item)
-                    self._wake()
-        except Exception as error:  # whatever ended this thread is raised to the reader, never lost with it
-            self._error = error
-            self._wake()

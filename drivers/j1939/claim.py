@@ -6,38 +6,20 @@ another address (arbitrary address capable) or says that it cannot claim and is 
 
 The standard asks for unique NAMEs and says nothing sensible about equal ones; answering each other's claim then never
 ends. Here every claim leaves through a limiter, equal NAMEs are reported and not answered without end, and a storm of
-foreign claims cannot make this node storm.
+foreign claims cannot make this node storm. A claim that is owed (to a request, to a NAME that loses) and that the
+limiter keeps back is put off and never dropped: whoever hears none takes the address for free.
 """
 
 from __future__ import annotations
 
+import math
 import random
 from enum import StrEnum
 from typing import Final
 
 from graderd.drivers.j1939.ids import GLOBAL, MAX_ADDRESS, NULL, Frame, Pgn, make_id
+from graderd.drivers.j1939.limiter import Limiter
 from graderd.drivers.j1939.name import Name
-
-
-class Limiter:
-    """Allows ``burst_n`` events at once and ``rate_hz`` in the long run."""
-
-    def __init__(self, rate_hz: float, burst_n: int) -> None:
-        self._rate_hz = rate_hz
-        self._burst_n = burst_n
-        self._tokens = float(burst_n)
-        self._last_s: float | None = None
-
-    def allow(self, now_s: float) -> bool:
-        """Take a token if there is one."""
-        if self._last_s is not None:
-            self._tokens = min(self._burst_n, self._tokens + (now_s - self._last_s) * self._rate_hz)
-        self._last_s = now_s
-        if self._tokens < 1.0:
-            return False
-        self._tokens -= 1.0
-        return True
-
 
 VETO_S: Final = 0.25
 """Wait after a claim before other traffic (J1939-81, addresses 128 to 247)."""
@@ -74,8 +56,6 @@ class AddressClaimer:
         self.wanted = preferred
         """The address claimed or being claimed."""
         self.contentions_n = 0
-        self.suppressed_n = 0
-        """Claims not sent because the limiter said no."""
         self.sent_n = 0
         self._preferred = preferred
         self._obey = obey_commanded
@@ -83,6 +63,7 @@ class AddressClaimer:
         self._limiter = Limiter(_CLAIM_RATE_HZ, _CLAIM_BURST_N)
         self._equal_name_limiter = Limiter(_EQUAL_NAME_RATE_HZ, _EQUAL_NAME_BURST_N)
         self._veto_until_s = 0.0
+        self._owed: int | None = None
         self._due_s: float | None = None
         self._retry_at_s: float | None = None
         self._refused: set[int] = set()
@@ -124,15 +105,15 @@ class AddressClaimer:
         return [ask, *self._claim(now_s)]
 
     def poll(self, now_s: float) -> list[Frame]:
-        """What became due: end of the veto time, a delayed claim or cannot-claim, a new try."""
+        """What became due: end of the veto time, a claim that was put off, a delayed cannot-claim, a new try."""
         if self._retry_at_s is not None and now_s >= self._retry_at_s:
             return self.start(now_s)
         if self._due_s is not None and now_s >= self._due_s:
             self._due_s = None
-            return self._send(NULL, now_s) if self.state is ClaimState.CANNOT_CLAIM else self._claim(now_s)
-        if self.state is ClaimState.WAITING and self._due_s is None and now_s >= self._veto_until_s:
+            return self._owe(NULL, now_s)
+        if self.state is ClaimState.WAITING and now_s >= self._veto_until_s:
             self.state = ClaimState.CLAIMED
-        return []
+        return self._pay(now_s)
 
     def on_claim(self, source: int, name: int, now_s: float) -> list[Frame]:
         """A claim of another node (or a cannot-claim, where ``source`` is 254)."""
@@ -151,12 +132,9 @@ class AddressClaimer:
         del self._foreign_times_s[: -2 * _STORM_N]
         if name == self.name.value:
             self._equal_name_at_s = now_s
-            if self._equal_name_limiter.allow(now_s):
-                return self._send(self.wanted, now_s)
-            self.suppressed_n += 1
-            return []
+            return self._owe(self.wanted, now_s) if self._equal_name_limiter.allow(now_s) else []
         if self.name.value < name:
-            return self._send(self.wanted, now_s)
+            return self._owe(self.wanted, now_s)
         self._foreign[source] = name
         self._refused.add(source)
         return self._take_another(now_s)
@@ -164,7 +142,7 @@ class AddressClaimer:
     def on_request(self, now_s: float) -> list[Frame]:
         """A request for address claimed, to us or to all."""
         if self.state in (ClaimState.WAITING, ClaimState.CLAIMED):
-            return self._send(self.wanted, now_s)
+            return self._owe(self.wanted, now_s)
         if self.state is ClaimState.CANNOT_CLAIM:
             self._schedule_cannot_claim(now_s)
         return []
@@ -173,7 +151,7 @@ class AddressClaimer:
         """Somebody else sent a frame from our address: claim again, at most once in five seconds."""
         quiet = not self.violated(now_s)
         self._violation_at_s = now_s if quiet else self._violation_at_s
-        return self._send(self.wanted, now_s) if quiet and self.state is ClaimState.CLAIMED else []
+        return self._owe(self.wanted, now_s) if quiet and self.state is ClaimState.CLAIMED else []
 
     def on_commanded(self, name: int, address: int, now_s: float) -> list[Frame]:
         """A commanded address (PGN 65240): obeyed only where configured and when it names us."""
@@ -191,6 +169,7 @@ class AddressClaimer:
                 self.wanted = address
                 return self._claim(now_s)
         self.state = ClaimState.CANNOT_CLAIM
+        self._owed = None
         self._retry_at_s = now_s + RETRY_S
         self._schedule_cannot_claim(now_s)
         return []
@@ -201,21 +180,24 @@ class AddressClaimer:
             self._due_s = due_s
 
     def _claim(self, now_s: float) -> list[Frame]:
-        frames = self._send(self.wanted, now_s)
         self.state = ClaimState.WAITING
-        if not frames:
-            self._due_s = now_s + VETO_S
-            return []
         self._due_s = None
-        needs_veto = 128 <= self.wanted <= 247
-        self._veto_until_s = now_s + (VETO_S if needs_veto else 0.0)
-        if not needs_veto:
-            self.state = ClaimState.CLAIMED
-        return frames
+        self._veto_until_s = math.inf  # it begins when the claim leaves
+        return self._owe(self.wanted, now_s)
 
-    def _send(self, source: int, now_s: float) -> list[Frame]:
-        if not self._limiter.allow(now_s):
-            self.suppressed_n += 1
+    def _owe(self, source: int, now_s: float) -> list[Frame]:
+        """A claim (from the null address: cannot claim), sent now or as soon as the limiter lets it."""
+        self._owed = source
+        return self._pay(now_s)
+
+    def _pay(self, now_s: float) -> list[Frame]:
+        if self._owed is None or not self._limiter.allow(now_s):
             return []
+        source, self._owed = self._owed, None
         self.sent_n += 1
+        if self.state is ClaimState.WAITING and math.isinf(self._veto_until_s):
+            if 128 <= self.wanted <= 247:
+                self._veto_until_s = now_s + VETO_S
+            else:
+                self.state = ClaimState.CLAIMED
         return [Frame(make_id(6, Pgn.ADDRESS_CLAIMED, source), self.name.to_bytes())]

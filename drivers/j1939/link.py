@@ -3,6 +3,9 @@
 The drivers of all devices on the bus share one :class:`CanLink`. It claims our J1939 address, sends every device's
 control message on a fixed 100 ms grid, hands feedback out by source address, tells stop messages, publishes DM1, and
 opens the bus again with back-off when it was lost. What is in the messages is the drivers' own.
+
+Without an address (contended, not claimed yet) a node is to be silent. A stop is not: whatever may be in motion is told
+to end it at once, from the address that was ours last, and told again until it stands. Electraks obey any address.
 """
 
 from __future__ import annotations
@@ -10,21 +13,23 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from graderd.drivers.j1939 import dm1
 from graderd.drivers.j1939.bus_health import BusEvent, BusHealth
-from graderd.drivers.j1939.can_port import BusPort, PortFullError, PortLostError, open_port
+from graderd.drivers.j1939.can_port import READY_S, BusPort, PortFullError, PortLostError, open_port
 from graderd.drivers.j1939.ids import GLOBAL, Frame, Pgn, destination_of, pgn_of, source_of
 from graderd.drivers.j1939.name import Name
 from graderd.drivers.j1939.node import Identity, J1939Node
+from graderd.drivers.j1939.self_reception import SelfReception
 from graderd.drivers.j1939.stop_message import StopWatcher
 from graderd.drivers.j1939.ticker import Ticker
 from graderd.drivers.j1939.transport import Message
 from graderd.hal.clock import Clock, SystemClock
-from graderd.hal.errors import DeviceError, DeviceMissingError
+from graderd.hal.errors import DeviceError, DeviceLostError, DeviceMissingError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.settings import CanSettings
 
@@ -46,6 +51,10 @@ class LinkUser(Protocol):
         """The control message that goes out now, from our address ``source``."""
         ...
 
+    def stop_frame(self, source: int, now_s: float) -> Frame | None:
+        """The control message that ends motion, for while we have no address; None where nothing can be moving."""
+        ...
+
     def on_feedback(self, data: bytes, now_s: float) -> None:
         """A message of the feedback group from the device's address."""
         ...
@@ -64,6 +73,7 @@ class LinkUser(Protocol):
 
 
 _log = logging.getLogger(__name__)
+_FIELDS = {"device": "can"}
 
 CONTROL_PERIOD_S: Final = 0.1
 _POLL_S: Final = 0.02
@@ -73,6 +83,8 @@ their period to some microseconds. What is left of it is spun, ten times a secon
 _BACKOFF_FIRST_S: Final = 0.1
 _BACKOFF_MAX_S: Final = 2.0
 _CLOSE_REPEATS_N: Final = 3
+_STOP_UNADDRESSED_S: Final = 2.0
+"""For so long after the address was lost, or the bus opened, motion is ended from the address that was ours last."""
 
 
 @dataclass(slots=True)
@@ -82,6 +94,7 @@ class LinkCounters:
     rx_n: int = 0
     tx_n: int = 0
     tx_full_n: int = 0
+    refused_n: int = 0
     lost_n: int = 0
     reopened_n: int = 0
     control_late_max_s: float = 0.0
@@ -90,6 +103,7 @@ class LinkCounters:
 @dataclass(slots=True)
 class _Taps:
     frames: list[Callable[[Frame, float], None]] = field(default_factory=list)
+    events: list[Callable[[BusEvent, float], None]] = field(default_factory=list)
     messages: list[Callable[[Message, float], None]] = field(default_factory=list)
 
 
@@ -123,6 +137,11 @@ class CanLink:
         self._health = BusHealth()
         self._stop = StopWatcher(settings.stop_pgn_n, settings.stop_on_iso11783_all_stop, on_stop)
         self._port: BusPort | None = None
+        self._own = SelfReception()
+        self._address: int | None = None
+        self._last_address = settings.source_address_n
+        self._unaddressed_since_s = -math.inf
+        self._address_lost_at_s: float | None = None
         self._users: dict[int, LinkUser] = {}
         self._feedback_pgns: frozenset[int] = frozenset()
         self._strangers: dict[tuple[int, int], float] = {}
@@ -156,7 +175,8 @@ class CanLink:
     def faults(self) -> tuple[DeviceFault, ...]:
         """Conditions of the bus present now, device ``can``."""
         now_s = self._clock.now_s()
-        self._health.watch_claim(self._node.claimer, now_s)
+        lost_for_s = 0.0 if self._address_lost_at_s is None else now_s - self._address_lost_at_s
+        self._health.watch_claim(self._node.claimer, lost_for_s, now_s)
         return self._health.faults(now_s)
 
     def strangers(self, pgn: int, now_s: float) -> tuple[int, ...]:
@@ -222,6 +242,11 @@ class CanLink:
         self._taps.frames.append(listener)
         return lambda: self._taps.frames.remove(listener)
 
+    def tap_events(self, listener: Callable[[BusEvent, float], None]) -> Callable[[], None]:
+        """Call ``listener`` with what the controller tells of the bus itself; returns the call that ends it."""
+        self._taps.events.append(listener)
+        return lambda: self._taps.events.remove(listener)
+
     def tap_messages(self, listener: Callable[[Message, float], None]) -> Callable[[], None]:
         """Call ``listener`` with every J1939 message, multi-packet ones included; returns the call that ends it."""
         self._taps.messages.append(listener)
@@ -245,11 +270,32 @@ class CanLink:
         self._node.publish(dtcs, amber=bool(dtcs), red=stopped, now_s=self._clock.now_s())
 
     def _control(self, user: LinkUser) -> Frame | None:
-        """A device's control message as it is now; None while nothing can be sent."""
-        address = self._node.address
-        if self._port is None or address is None:
+        """A device's control message as it is now; None where nothing can be sent, or nothing may."""
+        if self._port is None:
             return None
-        return user.control_frame(address, self._clock.now_s())
+        now_s = self._clock.now_s()
+        if self._node.address is not None:
+            return user.control_frame(self._node.address, now_s)
+        if now_s - self._unaddressed_since_s > _STOP_UNADDRESSED_S:
+            return None
+        return user.stop_frame(self._last_address, now_s)
+
+    def _send_all_controls(self) -> None:
+        for user in tuple(self._users.values()):
+            self.send_control(user)
+
+    def _follow_address(self, now_s: float) -> None:
+        """An address lost: what moves is stopped now. One gained: what is owed goes out now, not a period later."""
+        address = self._node.address
+        if address == self._address:
+            return
+        self._address = address
+        self._address_lost_at_s = None
+        if address is None:
+            self._unaddressed_since_s = self._address_lost_at_s = now_s
+        else:
+            self._last_address = address
+        self._send_all_controls()
 
     def _send(self, frame: Frame) -> bool:
         if self._port is None:
@@ -264,6 +310,7 @@ class CanLink:
             self._on_lost(error)
             return False
         self.counters.tx_n += 1
+        self._own.on_sent(frame, self._clock.now_s())
         if self._taps.frames:
             now_s = self._clock.now_s()
             for tap in self._taps.frames:
@@ -289,6 +336,11 @@ class CanLink:
         for item in items:
             if isinstance(item, BusEvent):
                 self._health.on_event(item, now_s)
+                for listener in self._taps.events:
+                    listener(item, now_s)
+                self.counters.refused_n += item is BusEvent.REFUSED
+                if item is BusEvent.ERROR_ACTIVE:
+                    self._send_all_controls()  # what was said while nobody heard us
             else:
                 self._on_frame(item, now_s)
         self.counters.rx_n += len(items)
@@ -299,6 +351,8 @@ class CanLink:
             self._flush()
 
     def _on_frame(self, frame: Frame, now_s: float) -> None:
+        if self._own.is_echo(frame, now_s):
+            return
         for tap in self._taps.frames:
             tap(frame, now_s)
         if not frame.extended:
@@ -315,6 +369,7 @@ class CanLink:
         if pgn == Pgn.ADDRESS_CLAIMED:
             self._on_claim(frame, now_s)
         message = self._node.on_frame(frame, now_s)
+        self._follow_address(now_s)
         if message is not None:
             self._stop.on_message(message, now_s)
             for listener in self._taps.messages:
@@ -342,7 +397,9 @@ class CanLink:
                     self.counters.control_late_max_s = max(self.counters.control_late_max_s, ticker.late_s)
                     for frame in frames:
                         self._send(frame)
-                self._node.poll(self._clock.now_s())
+                now_s = self._clock.now_s()
+                self._node.poll(now_s)
+                self._follow_address(now_s)
                 self._flush()
                 tick_n += await ticker.wait()
         finally:
@@ -359,10 +416,12 @@ class CanLink:
                 try:
                     await self._open_port()
                     self.counters.reopened_n += 1
+                    _log.info("%s: open again", self.where, extra=_FIELDS)
                 except DeviceError as error:
+                    _log.warning("%s: not open again: %s", self.where, error, extra=_FIELDS)
                     self._health.on_open_failed(error, self._clock.now_s())
                 except Exception:  # a bug in here must not end the search for the bus
-                    _log.exception("%s: opening failed in an unexpected way; will try again", self.where)
+                    _log.exception("%s: opening failed in an unexpected way; will try again", self.where, extra=_FIELDS)
 
     async def _open_port(self) -> None:
         self._lost.clear()
@@ -370,16 +429,26 @@ class CanLink:
             port = self._factory()
         else:
             port = await asyncio.to_thread(open_port, self.settings)
+            try:
+                await asyncio.to_thread(port.wait_ready, READY_S)
+            except PortLostError as error:
+                port.close()
+                raise DeviceLostError(self.where, error.detail) from error
         now_s = self._clock.now_s()
         self._port = port
         self._health.on_open()
+        self._own = SelfReception()
         asyncio.get_running_loop().add_reader(port.fileno(), self._on_readable)
         self._node.start(now_s)
+        self._address, self._address_lost_at_s, self._unaddressed_since_s = None, None, now_s
+        self._send_all_controls()
+        self._follow_address(now_s)
         self._flush()
 
     def _on_lost(self, error: PortLostError) -> None:
         now_s = self._clock.now_s()
-        _log.warning("%s: lost (%s): %s", self.where, error.condition, error.detail)
+        fields = {**_FIELDS, "fault": f"can.{error.condition}"}
+        _log.warning("%s: lost (%s): %s", self.where, error.condition, error.detail, extra=fields)
         self.counters.lost_n += 1
         self._health.on_lost(error.condition, error.detail, now_s)
         self._drop_port()

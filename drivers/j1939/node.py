@@ -7,8 +7,9 @@ from enum import IntEnum
 from typing import Final
 
 from graderd.drivers.j1939 import dm1
-from graderd.drivers.j1939.claim import AddressClaimer, ClaimState, Limiter
+from graderd.drivers.j1939.claim import AddressClaimer, ClaimState
 from graderd.drivers.j1939.ids import GLOBAL, NULL, Frame, Pgn, destination_of, make_id, pgn_of, source_of
+from graderd.drivers.j1939.limiter import Limiter
 from graderd.drivers.j1939.name import Name
 from graderd.drivers.j1939.transport import Message, Transport
 

@@ -7,11 +7,16 @@ import errno
 import fcntl
 import os
 import select
+import time
+from typing import Final
 
 import can
 from can.interfaces.slcan import slcanBus
 
-from graderd.drivers.j1939.bus_health import BusEvent
+from graderd.drivers.j1939.bus_health import REFUSED_N, BusEvent
+
+_OPEN_AGAIN_S: Final = 0.5
+"""An adapter that has not answered so long after it was told to open its channel is told again."""
 
 
 class QuietSlcanBus(slcanBus):
@@ -20,19 +25,61 @@ class QuietSlcanBus(slcanBus):
     The port is ours alone from before the first byte: a second opener would close the channel and take half the frames.
 
     The kernel's slcan driver knows two lines that python-can ignores: ``s<a|w|p|b>RRRTTT`` (controller state and
-    error counters) and ``e<n><codes>`` (errors; ``o`` and ``O`` are overruns).
+    error counters) and ``e<n><codes>`` (errors; ``o`` and ``O`` are overruns). An adapter that answers NACK (BEL) again
+    and again has forgotten that its channel is open; it is opened anew.
+
+    Raises:
+        ValueError: no adapter knows this bit rate.
+        CanInitializationError: no such port, no right to it, or another program has it.
     """
 
     def __init__(self, channel: str, bitrate: int) -> None:
+        if bitrate not in self._BITRATES:
+            raise ValueError(f"bit rate {bitrate}; slcan knows {', '.join(map(str, self._BITRATES))}")
+        self._opening = ("C", self._BITRATES[bitrate], "O")
+        self._answers_n = 0
+        self._refused_n = 0
         self.events: collections.deque[BusEvent] = collections.deque(maxlen=64)
         self._lines: collections.deque[str] = collections.deque()
         self._unsent = bytearray()
         self._lock_fd = _lock(channel.partition("@")[0])
         try:
-            super().__init__(channel, bitrate=bitrate, sleep_after_open=0.0, timeout=0)
+            super().__init__(channel, sleep_after_open=0.0, timeout=0)
+            self._open_channel()
         except BaseException:
             self._unlock()
             raise
+
+    def open(self) -> None:
+        """Nothing: python-can opens before the bit rate is set, and then again."""
+
+    def wait_open(self, timeout_s: float) -> bool:
+        """Wait until the adapter has answered the opening of its channel; False where it does not.
+
+        A board that resets when its port is opened hears nothing while it boots, so it is told again. There are
+        adapters that never answer and work all the same.
+
+        Raises:
+            CanOperationError: the adapter is gone.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            again_s = min(time.monotonic() + _OPEN_AGAIN_S, deadline_s)
+            while (left_s := again_s - time.monotonic()) > 0:
+                select.select([self.serialPortOrig.fileno()], [], [], left_s)
+                self._fill()
+                if self._answers_n >= len(self._opening):
+                    self.events.clear()  # closing what was not open is refused, and no news
+                    self._refused_n = 0
+                    return True
+            if time.monotonic() >= deadline_s:
+                return False
+            self._open_channel()
+
+    def _open_channel(self) -> None:
+        self._answers_n = 0
+        for command in self._opening:
+            self._write(command)
 
     def _write(self, string: str) -> None:
         self._unsent += string.encode() + self.LINE_TERMINATOR
@@ -96,7 +143,21 @@ class QuietSlcanBus(slcanBus):
         self._buffer += data.replace(b"\a", b"\a\r")
         *lines, rest = self._buffer.split(b"\r")
         self._buffer = bytearray(rest[-128:])
-        self._lines.extend(line.decode("ascii", "replace") + "\r" for line in lines if line and line != b"\a")
+        for line in lines:
+            if line.endswith(b"\a"):
+                self._note_refusal()
+            elif not line or bytes(line) in (b"z", b"Z"):
+                self._answers_n += 1
+                self._refused_n = 0
+            else:
+                self._lines.append(line.decode("ascii", "replace") + "\r")
+
+    def _note_refusal(self) -> None:
+        self._answers_n += 1
+        self._refused_n += 1
+        self.events.append(BusEvent.REFUSED)
+        if self._refused_n % REFUSED_N == 0:
+            self._open_channel()
 
     def _hung_up(self) -> bool:
         poller = select.poll()

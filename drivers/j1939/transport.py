@@ -1,7 +1,7 @@
 """Transport protocol of SAE J1939-21: messages of 9 to 1785 bytes in packets of seven.
 
 To everybody: BAM, packets 50 to 200 ms apart. To one node: RTS, CTS, packets, end-of-message acknowledgement, with
-abort. Receiving and sending of both kinds; sessions, sizes and times are bounded.
+abort. Receiving and sending of both kinds; sessions, sizes, times and what others can make us send are bounded.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 from graderd.drivers.j1939.ids import GLOBAL, Frame, Pgn, make_id
+from graderd.drivers.j1939.limiter import Limiter
 
 MAX_SIZE: Final = 1785
 BAM_GAP_S: Final = 0.05
@@ -24,6 +25,13 @@ T3_S: Final = 1.25
 T4_S: Final = 1.05
 """Sender: longest wait after a CTS that says wait."""
 MAX_SESSIONS_N: Final = 16
+DATA_RATE_HZ: Final = 100.0
+"""Packets a second of all connections together, after a burst: about 6 % of a bus of 250 kbit/s."""
+DATA_BURST_N: Final = 16
+_ASKED_FOR_MAX_N: Final = 3
+"""A packet may be asked for again twice (J1939-21); the whole of a message may leave so often."""
+_OPEN_RATE_HZ: Final = 50.0
+_OPEN_BURST_N: Final = 20
 _CTS_WINDOW_N: Final = 16
 
 
@@ -43,6 +51,7 @@ class Abort(IntEnum):
     BUSY = 1
     RESOURCES = 2
     TIMEOUT = 3
+    RETRANSMITS = 5
     BAD_SEQUENCE = 7
     TOO_BIG = 9
 
@@ -78,6 +87,7 @@ class _Outgoing:
     due_s: float
     next_n: int = 1
     window_end_n: int = 0
+    sent_n: int = 0
     waiting: bool = False
 
     @property
@@ -93,6 +103,8 @@ class Transport:
         self.aborted_n = 0
         self._incoming: dict[tuple[int, int], _Incoming] = {}
         self._outgoing: dict[int, _Outgoing] = {}
+        self._data = Limiter(DATA_RATE_HZ, DATA_BURST_N)
+        self._opens = Limiter(_OPEN_RATE_HZ, _OPEN_BURST_N)
 
     # -- receiving --------------------------------------------------------------------------------------------------
 
@@ -149,6 +161,8 @@ class Transport:
         size, packets_n = int.from_bytes(data[1:3], "little"), data[3]
         broadcast = data[0] == Control.BAM
         if broadcast != (destination == GLOBAL) or (not broadcast and destination != self.address):
+            return []
+        if not broadcast and not self._opens.allow(now_s):
             return []
         key = (source, destination)
         if not 9 <= size <= MAX_SIZE or packets_n != math.ceil(size / 7):
@@ -208,7 +222,8 @@ class Transport:
                     body = bytes((Abort.TIMEOUT, 255, 255, 255))
                     frames.append(self._control(source, Control.ABORT, body, incoming.pgn))
         for destination, outgoing in tuple(self._outgoing.items()):
-            if now_s < outgoing.due_s:
+            frames += self._packets(outgoing, now_s)
+            if now_s < outgoing.due_s or destination not in self._outgoing:
                 continue
             if outgoing.waiting:
                 del self._outgoing[destination]
@@ -232,9 +247,23 @@ class Transport:
             body = bytes((Abort.BAD_SEQUENCE, 255, 255, 255))
             return [self._control(session.destination, Control.ABORT, body, session.pgn)]
         session.next_n = first
+        session.window_end_n = min(session.packets_n, first + count - 1)
         session.due_s = now_s + T3_S
-        last_n = min(session.packets_n, first + count - 1)
-        return [self._packet(session) for _ in range(last_n - first + 1)]
+        return self._packets(session, now_s)
+
+    def _packets(self, session: _Outgoing, now_s: float) -> list[Frame]:
+        """What a connection may send now of the packets it was asked for."""
+        frames: list[Frame] = []
+        while session.next_n <= session.window_end_n and self._data.allow(now_s):
+            if session.sent_n >= _ASKED_FOR_MAX_N * session.packets_n:
+                del self._outgoing[session.destination]
+                self.aborted_n += 1
+                body = bytes((Abort.RETRANSMITS, 255, 255, 255))
+                return [*frames, self._control(session.destination, Control.ABORT, body, session.pgn)]
+            session.sent_n += 1
+            session.due_s = now_s + T3_S
+            frames.append(self._packet(session))
+        return frames
 
     def _packet(self, session: _Outgoing) -> Frame:
         start = 7 * (session.next_n - 1)
@@ -249,3 +278,65 @@ class Transport:
     def _control(self, destination: int, control: Control, body: bytes, pgn: int, priority: int = 7) -> Frame:
         can_id = make_id(priority, Pgn.TP_CONNECTION, self.address or 0, destination)
         return Frame(can_id, bytes((control,)) + body + pgn.to_bytes(3, "little"))
+
+
+class Listener:
+    """Puts together what others send each other, and says nothing itself. Time may be that of a log.
+
+    A session ends with its last packet, with an abort from either side, with a packet out of turn that nobody asked
+    for, or when nothing came for as long as the standard lets either side wait. The oldest of too many is forgotten.
+    """
+
+    def __init__(self) -> None:
+        self._sessions: dict[tuple[int, int], _Incoming] = {}
+
+    def on_frame(self, pgn: int, source: int, destination: int, data: bytes, now_s: float) -> Message | None:
+        """A frame of either of the protocol's two groups; the message where it is complete now."""
+        for key, session in tuple(self._sessions.items()):
+            if now_s > session.deadline_s:
+                del self._sessions[key]
+        if len(data) != 8:
+            return None
+        if pgn == Pgn.TP_DATA:
+            return self._on_data((source, destination), data, now_s)
+        about = int.from_bytes(data[5:8], "little")
+        match data[0]:
+            case Control.RTS | Control.BAM:
+                self._open((source, destination), about, data, now_s)
+            case Control.CTS:
+                asked = self._sessions.get((destination, source))
+                if asked is not None and asked.pgn == about:
+                    asked.deadline_s = now_s + (T2_S if data[1] else T4_S)
+                    if data[1] and 0 < data[2] < asked.next_n:  # asked for again
+                        asked.next_n = data[2]
+                        del asked.data[7 * (data[2] - 1) :]
+            case Control.ABORT:
+                for key in ((source, destination), (destination, source)):
+                    if key in self._sessions and self._sessions[key].pgn == about:
+                        del self._sessions[key]
+        return None
+
+    def _open(self, key: tuple[int, int], about: int, data: bytes, now_s: float) -> None:
+        size, packets_n, broadcast = int.from_bytes(data[1:3], "little"), data[3], data[0] == Control.BAM
+        self._sessions.pop(key, None)
+        if not 9 <= size <= MAX_SIZE or packets_n != math.ceil(size / 7) or broadcast != (key[1] == GLOBAL):
+            return
+        if len(self._sessions) >= MAX_SESSIONS_N:
+            del self._sessions[next(iter(self._sessions))]
+        self._sessions[key] = _Incoming(about, size, packets_n, broadcast, now_s + (T1_S if broadcast else T3_S))
+
+    def _on_data(self, key: tuple[int, int], data: bytes, now_s: float) -> Message | None:
+        session = self._sessions.get(key)
+        if session is None:
+            return None
+        if data[0] != session.next_n:
+            if session.broadcast:
+                del self._sessions[key]
+            return None
+        session.data += data[1:]
+        session.next_n += 1
+        session.deadline_s = now_s + (T1_S if session.broadcast else T3_S)
+        if session.next_n <= session.packets_n:
+            return None
+        del self._sessions[key]
+        return Message(session.pgn, *key, bytes(session.data[: session.size]))

@@ -111,8 +111,9 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts) -> APIR
             Body(openapi_examples={"reboot": {"summary": "Reboot the servo", "value": {"consent": True}}}),
         ] = None,
     ) -> dict[str, Any]:
-        """`rotation.verify_profile`, `rotation.reboot`, `rotation.step_response`, `camera.calibrate`. Those that
-        move a device or take its power want `consent: true`: somebody has looked and nobody is near the blade."""
+        """`rotation.verify_profile`, `rotation.reboot`, `rotation.step_response`, `camera.calibrate` (its pictures:
+        `camera.calibration_file`, once each). Those that move a device or take its power want `consent: true`: somebody
+        has looked and nobody is near the blade."""
         try:
             return await port.service(name, dict(arguments or {}))
         except ServiceError as error:

@@ -73,6 +73,18 @@ class Pace:
         self._next_s = max(self._next_s, now_s - self._depth_s) + self._interval_s
         return max(0.0, self._next_s - now_s)
 
+    def take(self, now_s: float) -> bool:
+        """Book a turn if it may be had at once, and say whether."""
+        if max(self._next_s, now_s - self._depth_s) + self._interval_s > now_s:
+            return False
+        self.delay_s(now_s)
+        return True
+
+
+def stop_pace(limits: ApiLimits) -> Pace:
+    """How many stops a second are carried out in full."""
+    return Pace(limits.stop_rate_hz, max(1, round(limits.stop_rate_hz / 10)))
+
 
 class Limiter:
     """ASGI middleware; see the module's text."""
@@ -82,7 +94,7 @@ class Limiter:
         self._limits = limits
         self._closing = closing
         self._pace = Pace(limits.rate_hz, limits.burst_n)
-        self._stop_pace = Pace(limits.stop_rate_hz, max(1, round(limits.stop_rate_hz / 10)))
+        self._stop_pace = stop_pace(limits)
         self._slots = asyncio.Semaphore(limits.active_n)
         self._services = asyncio.Semaphore(limits.services_n)
         self._waiting_n = 0

@@ -51,7 +51,8 @@ class DaemonPort(Protocol):
 
     async def service(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """A device service outside the control loop: ``rotation.verify_profile``, ``rotation.reboot``,
-        ``rotation.step_response``, ``camera.calibrate``. Those that move or unpower want ``consent: true``.
+        ``rotation.step_response``, ``camera.calibrate``, ``camera.calibration_file``.
+        Those that move or unpower want ``consent: true``.
 
         Raises:
             ServiceError: unknown, refused in this mode, or failed.

@@ -10,10 +10,11 @@ import logging
 import os
 import socket
 import stat
+import sys
 from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import h11
 import uvicorn
@@ -23,7 +24,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from graderd.api.limiter import Pace
-from graderd.api.problem import Problem
+from graderd.api.problem import Problem, ProblemError
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.api.tcp_guard import TcpGuard, load_or_make_token
 from graderd.hal.errors import DeviceError
@@ -147,6 +148,11 @@ ACCEPT_BURST_N = 20
 ACCEPT_RETRY_S = 0.1
 LISTEN_QUEUE_N = 128
 STREAM_BUFFER_BYTES = 16_384
+HEAD_MAX_BYTES = 8192
+"""Request line and headers."""
+READ_BYTES = 1024
+"""Some hundred of the smallest frames: a few milliseconds."""
+LINGER_S = 0.5
 
 
 async def serve(
@@ -175,8 +181,8 @@ async def serve(
         if tcp is not None:
             listener = stack.enter_context(tcp_socket(tcp))
             port_n = listener.getsockname()[1]
-            guarded = TcpGuard(app, load_or_make_token(tcp.token_file), port_n, tcp.allowed_hosts)
-            servers.append(_Server(_config(guarded, limits), listener, limits))
+            guard = TcpGuard(load_or_make_token(tcp.token_file), port_n, tcp.allowed_hosts)
+            servers.append(_Server(_config(app, limits, guard), listener, limits))
         tasks = [asyncio.create_task(server.run_until_told(), name=f"api server {server.name}") for server in servers]
         try:
             for server in servers:
@@ -193,10 +199,10 @@ async def serve(
             await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _config(app: ASGIApp, limits: ApiLimits) -> uvicorn.Config:
+def _config(app: ASGIApp, limits: ApiLimits, guard: TcpGuard | None = None) -> uvicorn.Config:
     return uvicorn.Config(
         app,
-        http=_bounded_http(limits),
+        http=_bounded_http(limits, guard),
         ws=_StreamProtocol,
         ws_max_size=limits.body_max_bytes_n,
         ws_per_message_deflate=False,
@@ -271,12 +277,89 @@ class _Server(uvicorn.Server):
         return protocol(config=self.config, server_state=self.server_state, app_state=self.lifespan.state)
 
 
-def _bounded_http(limits: ApiLimits) -> type[H11Protocol]:
+class _SmallReads(asyncio.BufferedProtocol):
+    """Takes what came in small pieces. asyncio reads up to 256 KiB at once, and the tick waits while a protocol takes
+    all of that apart: tens of thousands of frames, or a head of any length."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._piece = bytearray(READ_BYTES)
+
+    def get_buffer(self, sizehint: int) -> bytearray:
+        """Where the transport puts the next piece."""
+        del sizehint
+        return self._piece
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """A piece is there."""
+        self.data_received(bytes(self._piece[:nbytes]))
+
+    def eof_received(self) -> None:
+        """As in uvicorn: the transport closes."""
+
+    if TYPE_CHECKING:
+
+        def data_received(self, data: bytes) -> None:
+            """What the protocol does with a piece."""
+
+
+class _JudgedConnection(h11.Connection):
+    """h11's parser, which gives nobody a request whose head was not judged: by its size, and by the guard."""
+
+    def __init__(self, guard: TcpGuard | None) -> None:
+        super().__init__(h11.SERVER, HEAD_MAX_BYTES)
+        self._guard = guard
+
+    def next_event(self) -> Any:
+        """As in h11.
+
+        Raises:
+            h11.RemoteProtocolError: no valid HTTP, or a head that is too long.
+            _RefusedError: the guard does not let it in.
+        """
+        event = super().next_event()
+        if isinstance(event, h11.Request):
+            size_n = len(event.target) + sum(len(name) + len(value) + 4 for name, value in event.headers)
+            if size_n > HEAD_MAX_BYTES:
+                raise h11.RemoteProtocolError("too long a head", error_status_hint=431)
+            refusal = self._guard.refusal(event.target, event.headers) if self._guard is not None else None
+            if refusal is not None:
+                raise _RefusedError(refusal)
+        return event
+
+
+class _RefusedError(h11.RemoteProtocolError):
+    """A request that the guard does not let in, in the form in which uvicorn expects a parser to fail."""
+
+    def __init__(self, refusal: ProblemError) -> None:
+        super().__init__(str(refusal), refusal.status_code)
+        self.refusal = refusal
+
+
+def _problem_of(error: BaseException | None) -> tuple[int, Problem]:
+    """What to answer where a request's head was not taken."""
+    if isinstance(error, _RefusedError):
+        return error.refusal.status_code, error.refusal.problem
+    if isinstance(error, h11.RemoteProtocolError) and error.error_status_hint == 431:
+        return 431, Problem(
+            error=f"the request's head is longer than {HEAD_MAX_BYTES} bytes",
+            where="request",
+            remedy="send fewer or shorter headers",
+        )
+    return 400, Problem(error="this is no valid HTTP request", where="request")
+
+
+def _bounded_http(limits: ApiLimits, guard: TcpGuard | None) -> type[H11Protocol]:
     """uvicorn's HTTP protocol with a bound on open connections: the oldest makes room for a new one, so that a client
     that wants to send stop gets in however many hang about."""
     open_connections: OrderedDict[H11Protocol, None] = OrderedDict()
 
-    class BoundedProtocol(H11Protocol):
+    class BoundedProtocol(_SmallReads, H11Protocol):
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            super().__init__(*args, **kwargs)
+            self.conn = _JudgedConnection(guard)
+            self._ending: asyncio.TimerHandle | None = None
+
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as in uvicorn
             super().connection_made(transport)
             open_connections[self] = None
@@ -286,17 +369,28 @@ def _bounded_http(limits: ApiLimits) -> type[H11Protocol]:
 
         def connection_lost(self, exc: Exception | None) -> None:
             open_connections.pop(self, None)
+            if self._ending is not None:
+                self._ending.cancel()
             super().connection_lost(exc)
 
+        def data_received(self, data: bytes) -> None:
+            if self._ending is None:
+                super().data_received(data)
+
         def send_400_response(self, msg: str) -> None:
-            """What is no HTTP is answered in the same form as everything else, as far as it can be answered."""
-            problem = Problem(error=f"this is no valid HTTP request: {msg}", where="request")
+            """What was not taken is answered in the same form as everything else, as far as it can be answered."""
+            del msg  # uvicorn's word for any of the reasons; the error under way knows which
+            status_code, problem = _problem_of(sys.exc_info()[1])
             body = problem.model_dump_json().encode()
             length = str(len(body))
             headers = [("content-type", "application/json"), ("content-length", length), ("connection", "close")]
-            for event in (h11.Response(status_code=400, headers=headers), h11.Data(data=body), h11.EndOfMessage()):
+            response = h11.Response(status_code=status_code, headers=headers)
+            for event in (response, h11.Data(data=body), h11.EndOfMessage()):
                 self.transport.write(self.conn.send(event) or b"")
-            self.transport.close()
+            if self.transport.can_write_eof():
+                self.transport.write_eof()
+            # What still comes is thrown away for a moment: closed at once, the kernel would take the answer back.
+            self._ending = self.loop.call_later(LINGER_S, self.transport.close)
 
         def handle_websocket_upgrade(self, event: Any) -> None:
             open_connections.pop(self, None)
@@ -305,8 +399,10 @@ def _bounded_http(limits: ApiLimits) -> type[H11Protocol]:
     return BoundedProtocol
 
 
-class _StreamProtocol(WebSocketsSansIOProtocol):
+class _StreamProtocol(_SmallReads, WebSocketsSansIOProtocol):
     """uvicorn's WebSocket protocol with small buffers, so that what a slow client reads at last is not old."""
+
+    _pong = b""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
@@ -314,3 +410,16 @@ class _StreamProtocol(WebSocketsSansIOProtocol):
         connection = transport.get_extra_info("socket")
         if connection is not None:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, STREAM_BUFFER_BYTES)
+
+    def handle_ping(self) -> None:
+        """Answer; a client that does not read gets the newest answer alone, once it does (RFC 6455, 5.5.3)."""
+        answer = b"".join(self.conn.data_to_send())
+        if self.writable.is_set():
+            self.transport.write(answer)
+        else:
+            self._pong = answer or self._pong
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        answer, self._pong = self._pong, b""
+        self.transport.write(answer)

@@ -13,12 +13,14 @@ from pydantic import TypeAdapter, ValidationError
 from starlette.websockets import WebSocketDisconnect
 
 from graderd.api.http_routes import StatusTexts, obey
-from graderd.api.limiter import Closing
+from graderd.api.limiter import Closing, Pace, stop_pace
 from graderd.api.port import DaemonPort
 from graderd.api.problem import Problem, ProblemError, problem_of_validation
 from graderd.api.settings import ApiLimits
 from graderd.core.commands import AnyCommand, Command, Jog, Preset, Release, Reply, Stop
+from graderd.core.machine import Mode
 from graderd.core.status import Status
+from graderd.hal.text import printable
 
 COMMAND: TypeAdapter[Command] = TypeAdapter(AnyCommand)
 MALFORMED_PAUSE_S = 0.1
@@ -32,6 +34,7 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
     """The WebSockets over ``port``; ``closing`` ends them."""
     router = APIRouter(prefix="/v1")
     numbers = itertools.count(1)
+    stops = stop_pace(limits)
 
     @router.websocket("/stream")
     async def stream(socket: WebSocket, rate_hz: Annotated[float, Query(gt=0, le=1000)] = limits.stream_max_hz) -> None:
@@ -41,7 +44,7 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
     @router.websocket("/jog")
     async def jog(socket: WebSocket, client: Annotated[str, Query(max_length=60)] = "jog") -> None:
         await socket.accept()
-        session = _JogSession(port, limits, f"{client}#{next(numbers)}")
+        session = _JogSession(port, limits, stops, f"{printable(client)}#{next(numbers)}")
         try:
             await _until_closed(socket, session.run(socket), closing)
         finally:
@@ -81,9 +84,10 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
 class _JogSession:
     """One client's connection: its commands carry a name nobody else has, so its lease is its own."""
 
-    def __init__(self, port: DaemonPort, limits: ApiLimits, client: str) -> None:
+    def __init__(self, port: DaemonPort, limits: ApiLimits, stops: Pace, client: str) -> None:
         self._port = port
         self._limits = limits
+        self._stops = stops
         self._client = client
         self._moved = False
 
@@ -115,11 +119,20 @@ class _JogSession:
             self._moved = True
         if isinstance(command, Stop | Release):
             self._moved = False
+        if isinstance(command, Stop):
+            await self._turn_of_stop()
         try:
             reply = await obey(self._port, command, self._limits)
         except ProblemError as error:
             return error.problem
         return reply
+
+    async def _turn_of_stop(self) -> None:
+        """Wait for the turn of one of thousands of stops a second to a machine that the first has stopped. Each is
+        carried out and counted (a reset names the last), and one that finds the machine in any other mode at once."""
+        now_s = asyncio.get_running_loop().time()
+        if not self._stops.take(now_s) and self._port.status().mode is Mode.STOPPED:
+            await asyncio.sleep(self._stops.delay_s(now_s))
 
 
 async def _send_status(socket: WebSocket, port: DaemonPort, texts: StatusTexts, rate_hz: float) -> None:

@@ -22,6 +22,7 @@ from graderd.cli import (
     status,
 )
 from graderd.cli.console import CliError, ExitCode, print_error, print_text
+from graderd.client import ClientError, NoDaemonError
 from graderd.hal.errors import DeviceError
 
 COMMANDS = (
@@ -55,8 +56,8 @@ def make_cli() -> typer.Typer:
         socket: Annotated[
             Path | None,
             typer.Option(
-                help="The daemon's socket. Default: $GRADERD_SOCKET, else /run/graderd/graderd.sock, else "
-                "$XDG_RUNTIME_DIR/graderd/graderd.sock.",
+                help="The daemon's socket. Default: $GRADERD_SOCKET, else what /etc/graderd/graderd.toml says, else "
+                "/run/graderd/graderd.sock, else $XDG_RUNTIME_DIR/graderd/graderd.sock.",
             ),
         ] = None,
     ) -> None:
@@ -78,6 +79,9 @@ def run_app(arguments: list[str]) -> int:
     except CliError as error:
         print_error(error.where, error.cause, error.remedy, as_json)
         return error.exit_code
+    except ClientError as error:
+        print_error(error.where, error.cause, error.remedy, as_json)
+        return ExitCode.NO_DAEMON if isinstance(error, NoDaemonError) else ExitCode.FAILED
     except DeviceError as error:
         print_error(error.where, error.cause, error.remedy, as_json)
         return ExitCode.FAILED
@@ -87,9 +91,26 @@ def run_app(arguments: list[str]) -> int:
         where = path.removeprefix("graderd").strip()
         if error.format_message():  # a group without a command has printed its help instead
             print_error(where, error.format_message(), f"See '{path} --help'", as_json)
+        if _command(arguments) == "guard":
+            return processes.guard_all_the_same(arguments)
         return ExitCode.USAGE if error.exit_code == ExitCode.USAGE else ExitCode.FAILED
     except Abort:
         return ExitCode.FAILED
     except BrokenPipeError:
         return ExitCode.FAILED
+    except OSError as error:  # a file or directory that this user may not use
+        where = str(error.filename or "graderd")
+        print_error(where, error.strerror or str(error), "Run it as a user who may use it", as_json)
+        return ExitCode.FAILED
     return result if isinstance(result, int) else ExitCode.OK
+
+
+def _command(arguments: list[str]) -> str:
+    """The first word that is neither an option nor the socket's name."""
+    words = iter(arguments)
+    for word in words:
+        if word == "--socket":
+            next(words, None)
+        elif not word.startswith("-"):
+            return word
+    return ""

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 import os
-import shutil
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from graderd.cli.client import daemon_of
-from graderd.cli.console import CliError, ExitCode, Json, example, plain_table, print_json, print_text
+from graderd import places
+from graderd.cli.console import CliError, ExitCode, Json, client_of, example, plain_table, print_json, print_text
 from graderd.hal.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -19,9 +20,9 @@ if TYPE_CHECKING:
     from graderd.perception.calibration import CalibrationResult
     from graderd.perception.frame_set import FrameSet
 
-DEFAULT_CONFIG = Path("/etc/graderd/graderd.toml")
 DEFAULT_ANGLES_DEG = "-40,-20,0,20,40"
 LIVE_TIMEOUT_S = 120.0
+FETCH_TIMEOUT_S = 10.0
 POSE_NAMES = ("position_x_m", "position_y_m", "position_z_m", "pitch_down_deg", "yaw_deg", "roll_deg")
 BLADE_NAMES = ("x_offset_m", "length_m", "height_m")
 
@@ -59,9 +60,7 @@ def register(app: typer.Typer) -> None:
         angles_deg: Annotated[
             str, typer.Option(metavar="LIST", help="Blade angles to turn to, where the servo turns the blade.")
         ] = DEFAULT_ANGLES_DEG,
-        config: Annotated[
-            Path | None, typer.Option(help=f"Configuration to change. Default: {DEFAULT_CONFIG}.")
-        ] = None,
+        config: Annotated[Path | None, typer.Option(help=f"Configuration to change. Default: {places.CONFIG}.")] = None,
         save: Annotated[Path, typer.Option(metavar="FILE", help="Where the picture with the result goes.")] = Path(
             "calibration.jpg"
         ),
@@ -75,19 +74,23 @@ def register(app: typer.Typer) -> None:
 
         Without --from and --pose the running daemon turns the blade (after you consented) and takes the frames. The
         result is shown on a picture with LEFT and RIGHT where the operator's left and right are. Nothing is written
-        before you agree; the former file is kept as a dated backup.
+        before you agree; the former file is kept as a dated backup. The machine's own configuration is root's: with
+        sudo. Whoever may not write it learns that before anything moves.
         """
         if json and not yes:
             raise CliError("calibrate", "--json cannot ask", "Add --yes to consent", ExitCode.USAGE)
-        path = config or DEFAULT_CONFIG
+        path = config or places.CONFIG
         settings = _load(path, must_exist=config is not None)
         start_pose = _pose(pose)
+        _may_write(path)
         if source is None and start_pose is not None and not live:
             _by_hand(path, settings, start_pose, yes, json)
             return
-        frames = _recorded(source) if source is not None else _live(context, angles_deg, yes, json)
-        result = _solve(settings, frames, start_pose)
-        _picture(frames, result, save)
+        _may_save(save)
+        with TemporaryDirectory(prefix="graderd-") as room:
+            frames = _recorded(source or _live(context, Path(room), angles_deg, yes, json))
+            result = _solve(settings, frames, start_pose)
+            _picture(frames, result, save)
         if json:
             print_json(_result_object(settings, result, save))
         else:
@@ -101,10 +104,8 @@ def _load(path: Path, must_exist: bool) -> Config:
     from graderd.config.loader import ConfigError, load
     from graderd.config.models import Config as Model
 
-    if not path.exists() and not must_exist:
-        return Model()
     try:
-        return load(path)
+        return load(path) if must_exist or os.path.lexists(path) else Model()
     except ConfigError as error:
         raise CliError("", error.problems[0], "", ExitCode.USAGE) from None
 
@@ -146,20 +147,33 @@ def _recorded(source: Path) -> FrameSet:
         raise CliError(error.where, error.cause, error.remedy, ExitCode.USAGE) from None
 
 
-def _live(context: typer.Context, angles_deg: str, yes: bool, as_json: bool) -> FrameSet:
-    """Have the daemon turn the blade and take the frames; it leaves them as a frame set."""
+def _live(context: typer.Context, room: Path, angles_deg: str, yes: bool, as_json: bool) -> Path:
+    """Have the daemon turn the blade and take the frames, and fetch them into a frame set in ``room``."""
     try:
         angles = [float(part) for part in angles_deg.split(",")]
     except ValueError:
         raise CliError("--angles-deg", f"{angles_deg!r} is not a list of numbers", "", ExitCode.USAGE) from None
-    daemon = daemon_of(context)
+    daemon = client_of(context)
     if not as_json:
         print_text(
             f"The blade will turn to {', '.join(f'{angle:+g}' for angle in angles)} degrees, one after the other."
         )
     _agree("Is the blade empty and off the ground, and is everybody clear of it? Turn it now?", yes)
     answer = daemon.service("camera.calibrate", LIVE_TIMEOUT_S, consent=True, angles_deg=angles)
-    return _recorded(Path(answer["frame_set"]))
+    folder = room / _plain(answer["frame_set"])
+    folder.mkdir()
+    for name in answer["files"]:
+        picture = folder / _plain(name)
+        content = daemon.service("camera.calibration_file", FETCH_TIMEOUT_S, file=name)["base64"]
+        picture.write_bytes(base64.b64decode(content))
+    return folder
+
+
+def _plain(name: str) -> str:
+    """A name the daemon gave, where it stays in its folder: root shall not write where the daemon says."""
+    if name != Path(name).name or name in ("", ".", ".."):
+        raise CliError("camera.calibrate", f"the daemon names a file {name!r}", "See its log")
+    return name
 
 
 def _solve(settings: Config, frames: FrameSet, start_pose: dict[str, float] | None) -> CalibrationResult:
@@ -261,66 +275,34 @@ def _agree(question: str, yes: bool) -> None:
 
 
 def write_calibration(path: Path, changes: dict[str, Any]) -> Path | None:
-    """Put ``changes`` (tables of tables) into the configuration, keeping its comments and order; atomically.
-
-    The new text is checked as a whole first. Returns the dated backup of the former file, None where there was none.
+    """Put ``changes`` (tables of tables) into the configuration; the backup of the former file, None if there was none.
 
     Raises:
         CliError: it cannot be read or written, or would not be a valid configuration; the file is as it was.
     """
-    import tomlkit
-    from tomlkit.exceptions import TOMLKitError
-
-    from graderd.config.loader import ConfigError, parse
+    from graderd.config.loader import ConfigError
+    from graderd.config.rewrite import merged, rewrite
 
     try:
-        old = path.read_text(encoding="utf-8") if path.exists() else ""
-        document = tomlkit.parse(old)
-        _merge(document, changes)
-        new = tomlkit.dumps(document)
-        parse(tomlkit.parse(new).unwrap(), path, new)
-    except (OSError, UnicodeDecodeError, TOMLKitError) as error:
-        raise CliError(str(path), f"cannot be read ({error})", "Nothing was changed") from None
+        return rewrite(path, lambda text: merged(text, changes), create=True)
     except ConfigError as error:
-        raise CliError("", error.problems[0], "Nothing was changed") from None
-    temporary = path.with_name(f".{path.name}.new")
-    backup: Path | None = None
+        raise CliError("", error.problems[0]) from None
+
+
+def _may_write(path: Path) -> None:
+    """Learn now what would keep the result from being written: before the blade turns, and before the person waits."""
+    from graderd.config.loader import ConfigError
+    from graderd.config.rewrite import check_rights
+
     try:
-        if path.exists():
-            backup = path.with_name(f"{path.name}.{datetime.now(UTC):%Y%m%d-%H%M%S}.bak")
-            shutil.copy2(path, backup)
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(new)
-            file.flush()
-            os.fsync(file.fileno())
-        if backup is not None:
-            was = path.stat()
-            shutil.copystat(path, temporary)
-            if os.geteuid() == 0:
-                os.chown(temporary, was.st_uid, was.st_gid)
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise CliError(
-            str(path),
-            f"cannot be written ({error.strerror})",
-            "Run as a user who may write it, or name another --config",
-        ) from None
-    return backup
+        check_rights(path)
+    except ConfigError as error:
+        raise CliError("", error.problems[0]) from None
 
 
-def _merge(table: Any, changes: dict[str, Any]) -> None:
-    import tomlkit
-
-    for key, value in changes.items():
-        if isinstance(value, dict):
-            if key not in table:
-                table[key] = tomlkit.table()
-            _merge(table[key], value)
-        else:
-            table[key] = (
-                round(value, 6) if isinstance(value, float) else list(value) if isinstance(value, tuple) else value
-            )
+def _may_save(picture: Path) -> None:
+    if not os.access(picture if picture.exists() else picture.parent, os.W_OK):
+        raise CliError(str(picture), "cannot be written", "Name another with --save")
 
 
 def _done(path: Path, backup: Path | None, as_json: bool) -> None:

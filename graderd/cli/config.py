@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, cast
 
 import typer
 
-from graderd.cli.console import CliError, Json, example, print_error, print_json, print_text
+from graderd import places
+from graderd.cli.console import CliError, ExitCode, Json, example, print_error, print_json, print_text
 
 if TYPE_CHECKING:
     from graderd.config import Config
@@ -22,11 +23,15 @@ def register(app: typer.Typer) -> None:
 
     @config.command(epilog=example("graderd config check /etc/graderd/graderd.toml"))
     def check(file: File = None, json: Json = False) -> None:
-        """Say whether a configuration file is valid.
+        """Say whether a configuration file is valid, and one this computer can run.
 
         Every mistake gets a line with place, cause and remedy.
         """
-        _load(file, json)
+        from graderd.runtime.app import problems
+
+        refusals = problems(_load(file, json))
+        if refusals:
+            _refuse([f"{file or places.CONFIG}: {line}" for line in refusals], json)
         if json:
             print_json({"valid": True, "problems": []})
         else:
@@ -44,19 +49,20 @@ def register(app: typer.Typer) -> None:
 
 def _load(file: Path | None, as_json: bool) -> Config:
     from graderd.config import ConfigError, load
-    from graderd.runtime.app import check_drivers
 
     try:
-        config = load(file)
-        check_drivers(config)
-        return config
+        return load(file)
     except ConfigError as error:
-        if as_json:
-            print_json({"valid": False, "problems": error.problems})
-            raise typer.Exit(1) from error
-        for problem in error.problems[:-1]:
-            print_error("", problem, "", as_json=False)
-        raise CliError("", error.problems[-1]) from error
+        _refuse(error.problems, as_json)
+
+
+def _refuse(problems: list[str], as_json: bool) -> NoReturn:
+    if as_json:
+        print_json({"valid": False, "problems": problems})
+        raise typer.Exit(ExitCode.FAILED)
+    for problem in problems[:-1]:
+        print_error("", problem, "", as_json=False)
+    raise CliError("", problems[-1])
 
 
 def _toml(resolved: dict[str, Any]) -> str:

@@ -8,9 +8,13 @@ import sys
 from collections.abc import Sequence
 from enum import IntEnum
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from graderd.client import Client
+from graderd.hal.text import printable, terminal_safe_json
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -40,12 +44,18 @@ class CliError(Exception):
         self.exit_code = exit_code
 
 
+def client_of(context: typer.Context) -> Client:
+    """A client of the daemon that the global options name."""
+    options = context.find_root().obj
+    return Client(options if isinstance(options, Path) else None)
+
+
 def error_line(where: str, cause: str, remedy: str = "") -> str:
     """``graderd: WHERE: why. What to do``, in one line whatever the parts contain."""
     head = f"graderd: {where}: {cause}" if where else f"graderd: {cause}"
     if remedy and not remedy.startswith("graderd "):
         remedy = remedy[0].upper() + remedy[1:]
-    return " ".join((f"{head.rstrip('.')}. {remedy}" if remedy else head).split())
+    return printable(" ".join((f"{head.rstrip('.')}. {remedy}" if remedy else head).split()))
 
 
 def print_error(where: str, cause: str, remedy: str, as_json: bool) -> None:
@@ -57,13 +67,14 @@ def print_error(where: str, cause: str, remedy: str, as_json: bool) -> None:
 
 def print_json(value: Any) -> None:
     """One JSON object on one line, flushed: a program may be reading line by line."""
-    sys.stdout.write(json.dumps(value, ensure_ascii=False, allow_nan=False) + "\n")
+    sys.stdout.write(terminal_safe_json(json.dumps(value, ensure_ascii=False, allow_nan=False)) + "\n")
     sys.stdout.flush()
 
 
 def print_text(text: str) -> None:
-    """A line for people."""
-    typer.echo(text)
+    """Lines for people. Nothing in them commands the terminal; a part that is somebody else's word, and must not begin
+    a line of its own, goes through :func:`printable` before it comes here."""
+    typer.echo("\n".join(printable(line) for line in text.split("\n")))
 
 
 def for_people() -> bool:
@@ -96,13 +107,14 @@ def rich_table(title: str, header: Row, rows: Sequence[Row]) -> RenderableType:
     for name in header:
         table.add_column(name)
     for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
+        table.add_row(*(Text(printable(cell)) for cell in row))
     return table
 
 
 def plain_table(title: str, header: Row, rows: Sequence[Row]) -> str:
     """The table as aligned text."""
-    lines = [tuple(header), *(tuple(row) for row in rows)] if any(header) else [tuple(row) for row in rows]
+    cells = [tuple(printable(cell) for cell in row) for row in rows]
+    lines = [tuple(header), *cells] if any(header) else cells
     widths = [max((len(line[column]) for line in lines), default=0) for column in range(len(header))]
     body = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
     return "\n".join([title, *(f"  {line}" for line in body)] if title else body)

@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from graderd.cli.client import Daemon, client_name, daemon_of
-from graderd.cli.console import CliError, Json, example, print_json, print_table, print_text
+from graderd.cli.console import CliError, Json, client_of, example, print_json, print_table, print_text
+from graderd.client import Client, ClientError, RefusedError
+from graderd.hal.text import printable
 
 ARMING_S = 8.0
 POLL_S = 0.05
@@ -23,15 +24,13 @@ def register(app: typer.Typer) -> None:
 
         Lists what is met and what is not, and refuses while anything needed is not.
         """
-        daemon = daemon_of(context)
-        refusal: CliError | None = None
+        client = client_of(context)
+        refusal: RefusedError | CliError | None = None
         try:
-            daemon.command("arm")
-            status = _after_arming(daemon)
-        except CliError as error:
-            if error.where != "arm":
-                raise
-            refusal, status = error, daemon.get("/v1/status")
+            send(client, "arm")
+            status = _after_arming(client)
+        except (RefusedError, CliError) as error:
+            refusal, status = error, client.get("/v1/status")
         readiness = status["readiness"]
         if json:
             if refusal is None:
@@ -59,11 +58,12 @@ def register(app: typer.Typer) -> None:
         Wins over everything and stays until reset.
         """
         try:
-            body = {"client": client_name()[:80], "reason": reason[:200]}
-            _tell(daemon_of(context).post("/v1/stop", body), json)
-        except CliError as error:
-            remedy = f"{error.remedy}. If the blade moves, use the emergency stop"
-            raise CliError(error.where, error.cause, remedy, error.exit_code) from error
+            client = client_of(context)
+            # As it came: the typed reply would load the models.
+            _tell(client.post("/v1/stop", {"client": client.name, "reason": reason[:200]}), json)
+        except ClientError as error:
+            error.remedy = f"{error.remedy}. If the blade moves, use the emergency stop"
+            raise
 
     @app.command(epilog=example("graderd reset && graderd arm"))
     def reset(context: typer.Context, json: Json = False) -> None:
@@ -71,8 +71,8 @@ def register(app: typer.Typer) -> None:
 
         It clears the stop that is latched when the command starts, and none that comes meanwhile.
         """
-        daemon = daemon_of(context)
-        _tell(daemon.command("reset", stop_n=daemon.get("/v1/status")["stop_n"]), json)
+        client = client_of(context)
+        _tell(send(client, "reset", stop_n=client.get("/v1/status")["stop_n"]), json)
 
     @app.command(epilog=example("graderd auto"))
     def auto(context: typer.Context, json: Json = False) -> None:
@@ -86,17 +86,23 @@ def register(app: typer.Typer) -> None:
 
 
 def _send(context: typer.Context, command: str, as_json: bool) -> None:
-    _tell(daemon_of(context).command(command), as_json)
+    _tell(send(client_of(context), command), as_json)
+
+
+def send(client: Client, command: str, **fields: Any) -> dict[str, Any]:
+    """A command; its reply as it came."""
+    reply: dict[str, Any] = client.post("/v1/commands", {"command": command, "client": client.name, **fields})
+    return reply
 
 
 def _tell(reply: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print_json(reply)
     else:
-        print_text(reply["message"])
+        print_text(printable(reply["message"]))
 
 
-def _after_arming(daemon: Daemon) -> dict[str, Any]:
+def _after_arming(client: Client) -> dict[str, Any]:
     """Status once arming has ended.
 
     Raises:
@@ -104,7 +110,7 @@ def _after_arming(daemon: Daemon) -> dict[str, Any]:
     """
     give_up_s = time.monotonic() + ARMING_S
     while True:
-        status: dict[str, Any] = daemon.get("/v1/status")
+        status: dict[str, Any] = client.get("/v1/status")
         if status["mode"] in ("manual", "auto"):
             return status
         if not status["arming"]:

@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import json as json_module
 import re
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 
-from graderd.cli.client import Daemon, client_name, daemon_of
-from graderd.cli.console import CliError, ExitCode, Json, example, print_json, print_table, print_text
+from graderd.cli.console import CliError, ExitCode, Json, client_of, example, print_json, print_table, print_text
+from graderd.client import Client
 from graderd.core.axes import AXES, JOG_AXES, JogName
 
-if TYPE_CHECKING:
-    from websockets.sync.client import ClientConnection
-
-
-RENEW_S = 0.1
-REPLY_S = 2.0
 SETTLED_S = 0.3
 HELD_S = 1.0
 VALUE = re.compile(r"(?P<absolute>=)?(?P<sign>[+-])?(?P<number>\d{1,6}(\.\d{0,9})?|\.\d{1,9})\s*(?P<unit>[^\d\s.]*)")
@@ -74,7 +67,7 @@ def _jog(app: typer.Typer) -> None:
         """
         wish = parse_value(axis, value)
         command = {"command": "jog", "axis": axis, "value": wish.value, "relative": wish.relative}
-        move(daemon_of(context), command, JOG_AXES[axis].moves, hold_s, timeout_s, json)
+        move(client_of(context), command, JOG_AXES[axis].moves, hold_s, timeout_s, json)
 
 
 def parse_value(axis: JogName, text: str) -> JogValue:
@@ -100,7 +93,7 @@ def parse_value(axis: JogName, text: str) -> JogValue:
 
 
 def move(
-    daemon: Daemon,
+    client: Client,
     command: dict[str, Any],
     axes: tuple[str, ...],
     hold_s: float | None,
@@ -114,19 +107,17 @@ def move(
     """
     name = command["command"]
     interrupted = False
-    with (
-        daemon.websocket("/v1/stream", rate_hz=20.0) as stream,
-        daemon.websocket("/v1/jog", client=f"{client_name()[:40]} {name}") as lease,
-    ):
-        since_s = _first(stream)["time_s"]
-        _ask(lease, command)
+    with client.lease(name) as lease:
+        if name == "jog":
+            lease.jog(command["axis"], command["value"], relative=command["relative"])
+        else:
+            lease.preset(command["name"])
         started_s = time.monotonic()
-        arrival = Arrival(axes, since_s)
+        arrival = Arrival(axes)
         try:
-            while True:
-                status = _newest(stream)
+            for status in lease.raw_statuses():
+                arrived = arrival.update(status)
                 elapsed_s = time.monotonic() - started_s
-                arrived = status is not None and arrival.update(status)
                 if elapsed_s >= hold_s if hold_s is not None else arrived:
                     break
                 if arrival.held_by is not None:
@@ -135,11 +126,8 @@ def move(
                     raise CliError(name, why, fault["remedy"])
                 if elapsed_s >= timeout_s:
                     raise CliError(name, f"not there after {timeout_s:g} s: {arrival.where()}", "see graderd status")
-                time.sleep(RENEW_S)
-                _renew(lease, daemon)
         except KeyboardInterrupt:
             interrupted = True
-        _ask(lease, {"command": "release"}, may_refuse=True)
     result = {
         "command": name,
         "arrived": arrival.arrived,
@@ -159,9 +147,8 @@ class Arrival:
     ``held_by``: the fault for which the daemon has held all of them for ``HELD_S``; None where there is none.
     """
 
-    def __init__(self, axes: tuple[str, ...], since_s: float) -> None:
+    def __init__(self, axes: tuple[str, ...]) -> None:
         self._axes = axes
-        self._since_s = since_s
         self._there_since_s: float | None = None
         self._held_since_s: float | None = None
         self.arrived = False
@@ -170,9 +157,7 @@ class Arrival:
         self._texts: list[str] = []
 
     def update(self, status: dict[str, Any]) -> bool:
-        """Take a status into account. Those from before the jog say nothing."""
-        if status["time_s"] <= self._since_s:
-            return False
+        """Take a status into account."""
         axes = [status["axes"][name] for name in self._axes if name in status["axes"]]
         self.measured = {axis["name"]: axis["measured"] for axis in axes}
         self._texts = [_axis_text(axis) for axis in axes]
@@ -211,50 +196,6 @@ def _axis_text(axis: dict[str, Any]) -> str:
     return f"{axis['name']} {axis['measured']:.1f} {axis['unit']}{because}"
 
 
-def _ask(
-    lease: ClientConnection,
-    command: dict[str, Any],
-    may_refuse: bool = False,
-) -> None:
-    """Send one command on the jog socket and wait for its reply."""
-    lease.send(json_module.dumps(command))
-    try:
-        reply = json_module.loads(lease.recv(REPLY_S))
-    except TimeoutError:
-        raise CliError(command["command"], "the daemon did not answer", "see its log") from None
-    if reply.get("accepted") or may_refuse:
-        return
-    raise CliError(command["command"], reply.get("message") or reply.get("error", ""), reply.get("remedy", ""))
-
-
-def _renew(lease: ClientConnection, daemon: Daemon) -> None:
-    """Keep the lease. Where it is gone, the machine's own reason says why."""
-    try:
-        _ask(lease, {"command": "renew"})
-    except CliError as error:
-        status = daemon.get("/v1/status")
-        raise CliError(
-            "jog", f"ended on the way: {status['mode']}, {status['reason']}", "see graderd status"
-        ) from error
-
-
-def _first(stream: ClientConnection) -> dict[str, Any]:
-    try:
-        return cast("dict[str, Any]", json_module.loads(stream.recv(REPLY_S)))
-    except TimeoutError:
-        raise CliError("daemon", "it sends no status", "see its log") from None
-
-
-def _newest(stream: ClientConnection) -> dict[str, Any] | None:
-    """The last status that has come, None if none came since."""
-    newest = None
-    try:
-        while True:
-            newest = stream.recv(0)
-    except TimeoutError:
-        return None if newest is None else json_module.loads(newest)
-
-
 def _preset(app: typer.Typer) -> None:
 
     @app.command(epilog=example("graderd preset", "graderd preset transport"))
@@ -268,8 +209,8 @@ def _preset(app: typer.Typer) -> None:
 
         The poses are the configuration's. The blade holds when the command ends.
         """
-        daemon = daemon_of(context)
-        names = daemon.get("/v1/status")["presets"]
+        client = client_of(context)
+        names = client.get("/v1/status")["presets"]
         if name is None:
             if json:
                 print_json({"presets": names})
@@ -278,4 +219,4 @@ def _preset(app: typer.Typer) -> None:
             return
         if name not in names:
             raise CliError("preset", f"there is no preset {name!r}", f"there are: {', '.join(names) or 'none'}")
-        move(daemon, {"command": "preset", "name": name}, AXES, None, timeout_s, json)
+        move(client, {"command": "preset", "name": name}, AXES, None, timeout_s, json)

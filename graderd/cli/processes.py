@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import logging
+import itertools
 from pathlib import Path
 from typing import Annotated
 
@@ -55,17 +55,29 @@ def _guard(app: typer.Typer) -> None:
         """Make the machine safe without a daemon.
 
         Sends motion-disable to the actuators and makes the servo safe. systemd runs it whenever the daemon has
-        ended, whatever it ended of.
+        ended, whatever it ended of. It acts on what the daemon last ran with, also where the file has changed since or
+        cannot be read, and on a command line with a mistake in it.
         """
-        from graderd.runtime.app import run_guard
+        raise typer.Exit(_make_safe(config, json))
 
-        log = logging.getLogger("graderd")
-        log.addHandler(logging.StreamHandler())
-        log.setLevel(logging.INFO)
-        status = run_guard(config)
-        if json:
-            print_json({"safe": status == 0})
-        raise typer.Exit(status)
+
+def guard_all_the_same(arguments: list[str]) -> int:
+    """``graderd guard`` from a command line that is not right: what can be found in it counts, the rest is left."""
+    given = [value for name, value in itertools.pairwise([*arguments, ""]) if name == "--config"]
+    given += [argument.removeprefix("--config=") for argument in arguments if argument.startswith("--config=")]
+    path = next((Path(value) for value in given if value and not value.startswith("-")), None)
+    return _make_safe(path, "--json" in arguments)
+
+
+def _make_safe(config: Path | None, as_json: bool) -> int:
+    from graderd.runtime.app import run_guard
+    from graderd.runtime.app.journal import set_up_logging
+
+    set_up_logging(as_json=False)
+    status = run_guard(config)
+    if as_json:
+        print_json({"safe": status == 0})
+    return status
 
 
 def _rig(app: typer.Typer) -> None:

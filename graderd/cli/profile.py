@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from graderd.cli.client import daemon_of
-from graderd.cli.console import ExitCode, Json, example, print_json, print_table, print_text
+from graderd.cli.console import ExitCode, Json, client_of, example, print_json, print_table, print_text
 
 SERVICE_S = 30.0
 
@@ -39,7 +38,7 @@ def register(app: typer.Typer) -> None:
         Moves nothing, and works while the device is refused for what it finds. The exit status is 1 where something is
         wrong; a setting that is merely not the factory's ("default") is shown and is not.
         """
-        answer = daemon_of(context).service(f"{device.value}.verify_profile", SERVICE_S)
+        answer = client_of(context).service(f"{device.value}.verify_profile", SERVICE_S)
         differences = answer.get("differences", [])
         if json:
             print_json(answer)

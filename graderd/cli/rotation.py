@@ -7,8 +7,17 @@ from typing import Annotated, Any
 
 import typer
 
-from graderd.cli.client import daemon_of
-from graderd.cli.console import CliError, ExitCode, Json, example, for_people, print_json, print_table, print_text
+from graderd.cli.console import (
+    CliError,
+    ExitCode,
+    Json,
+    client_of,
+    example,
+    for_people,
+    print_json,
+    print_table,
+    print_text,
+)
 
 SERVICE_S = 120.0
 Yes = Annotated[
@@ -28,7 +37,7 @@ def register(app: typer.Typer) -> None:
         Disarmed only; the blade has no torque for a moment.
         """
         need_consent("rotation reboot", "the blade loses its torque for a moment", yes)
-        answer = daemon_of(context).service("rotation.reboot", SERVICE_S, consent=True)
+        answer = client_of(context).service("rotation.reboot", SERVICE_S, consent=True)
         if json:
             print_json(answer)
         else:
@@ -41,7 +50,7 @@ def register(app: typer.Typer) -> None:
         Disarmed only. Nothing but pings is sent; the servo in use is lost for ten seconds and found again.
         """
         need_consent("rotation scan", "the servo is not watched for ten seconds", yes)
-        answer = daemon_of(context).service("rotation.scan", SERVICE_S, consent=True)
+        answer = client_of(context).service("rotation.scan", SERVICE_S, consent=True)
         servos = answer.get("servos", [])
         if json:
             print_json(answer)
@@ -58,7 +67,7 @@ def register(app: typer.Typer) -> None:
         Look at the blade and compare it with the angle of 'graderd status' first. Disarmed only.
         """
         need_consent("rotation confirm-turns", "the angle shown is taken for the blade's", yes)
-        answer = daemon_of(context).service("rotation.confirm_turns", SERVICE_S, consent=True)
+        answer = client_of(context).service("rotation.confirm_turns", SERVICE_S, consent=True)
         if json:
             print_json(answer)
         else:
@@ -77,7 +86,7 @@ def register(app: typer.Typer) -> None:
         Rise, overshoot, settling and play, with the settings used. Disarmed only.
         """
         need_consent("rotation step", f"the blade turns by {by_deg:+g} degrees and back", yes)
-        answer = daemon_of(context).service("rotation.step_response", SERVICE_S, consent=True, step_deg=by_deg)
+        answer = client_of(context).service("rotation.step_response", SERVICE_S, consent=True, step_deg=by_deg)
         page = answer.pop("report_html", None)
         if report is not None:
             _write(report, page)

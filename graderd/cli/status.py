@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json as json_module
 import time
-from collections.abc import Iterator
 from typing import Annotated, Any
 
 import typer
 
-from graderd.cli.client import Daemon, daemon_of
 from graderd.cli.console import (
     Json,
     Row,
+    client_of,
     example,
     for_people,
     plain_table,
@@ -21,6 +19,8 @@ from graderd.cli.console import (
     print_text,
     rich_table,
 )
+from graderd.client import Client
+from graderd.hal.text import printable
 
 THERMAL_SHOWN = 0.05
 Section = tuple[str, Row, list[Row]]
@@ -38,11 +38,11 @@ def register(app: typer.Typer) -> None:
         json: Json = False,
     ) -> None:
         """Show mode, axes, soil, faults, readiness and health."""
-        daemon = daemon_of(context)
+        client = client_of(context)
         if watch:
-            _watch(daemon, json)
+            _watch(client, json)
             return
-        state = daemon.get("/v1/status")
+        state = client.get("/v1/status")
         if json:
             print_json(state)
         elif for_people():
@@ -51,37 +51,32 @@ def register(app: typer.Typer) -> None:
             print_text("\n".join(plain_table(*section) for section in sections(state)))
 
 
-def _watch(daemon: Daemon, as_json: bool) -> None:
+def _watch(client: Client, as_json: bool) -> None:
     """A live table on a terminal, else one line or object per change of second."""
     try:
         if as_json or not for_people():
-            for state in _stream(daemon, 10.0 if as_json else 1.0):
-                if as_json:
-                    print_json(state)
-                else:
-                    print_text(summary(state))
+            with client.raw_statuses(10.0 if as_json else 1.0) as states:
+                for state in states:
+                    if as_json:
+                        print_json(state)
+                    else:
+                        print_text(summary(state))
             return
         from rich.console import Group
         from rich.live import Live
 
-        with Live(auto_refresh=False, screen=True) as live:
-            for state in _stream(daemon, 10.0):
+        with client.raw_statuses(10.0) as states, Live(auto_refresh=False, screen=True) as live:
+            for state in states:
                 live.update(Group(*(rich_table(*section) for section in sections(state))), refresh=True)
     except KeyboardInterrupt:
         return
-
-
-def _stream(daemon: Daemon, rate_hz: float) -> Iterator[dict[str, Any]]:
-    with daemon.websocket("/v1/stream", rate_hz=rate_hz) as stream:
-        while True:
-            yield json_module.loads(stream.recv())
 
 
 def summary(state: dict[str, Any]) -> str:
     """One line: mode, reason, angle, soil, faults."""
     rotation = state["axes"].get("rotation", {})
     faults = ", ".join(fault["name"] for fault in state["faults"]) or "none"
-    return (
+    return printable(
         f"{time.strftime('%H:%M:%S')} {state['mode']} ({state['reason']}) soil {state['soil']['zone']} "
         f"rotation {_number(rotation.get('requested'), 'deg')} -> {_number(rotation.get('measured'), 'deg')} "
         f"faults {faults}"

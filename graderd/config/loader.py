@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import difflib
 import tomllib
 import types
@@ -11,12 +12,13 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, Tag, ValidationError
 
+from graderd import places
 from graderd.config.models import Config
 from graderd.hal.settings import Settings
 
 S = TypeVar("S", bound=Settings)
 
-DEFAULT_PATHS = (Path("/etc/graderd/graderd.toml"),)
+_MARKS = {codecs.BOM_UTF8: "a byte order mark", codecs.BOM_UTF16_LE: "UTF-16 text", codecs.BOM_UTF16_BE: "UTF-16 text"}
 
 
 class ConfigError(Exception):
@@ -29,23 +31,57 @@ class ConfigError(Exception):
 
 
 def load(path: Path | None = None) -> Config:
-    """Read ``path``, or the first of the default paths that exists, or take the defaults.
+    """Read ``path``, or the default path where a file is there, or take the defaults.
 
     Raises:
         ConfigError: unreadable, not TOML, or not a valid configuration.
     """
-    if path is None:
-        path = next((p for p in DEFAULT_PATHS if p.exists()), None)
+    wanted = path or places.CONFIG
+    try:
+        raw = wanted.read_bytes()
+    except FileNotFoundError as error:
         if path is None:
             return Config()
-    try:
-        text = path.read_text(encoding="utf-8")
+        raise _unreadable(wanted, error, "Name another file with --config") from None
+    except PermissionError as error:
+        remedy = "Run it as root or as a member of the file's group, or name another file with --config"
+        raise _unreadable(wanted, error, remedy) from None
     except OSError as error:
-        raise ConfigError(
-            path, [f"{path}: cannot be read ({error.strerror}). Name another file with --config"]
-        ) from None
+        raise _unreadable(wanted, error, "Name another file with --config") from None
+    return parse_text(decode(raw, wanted), wanted)
+
+
+def _unreadable(path: Path, error: OSError, remedy: str) -> ConfigError:
+    return ConfigError(path, [f"{path}: cannot be read ({error.strerror}). {remedy}"])
+
+
+def decode(raw: bytes, path: Path) -> str:
+    """The file's text, its line ends as ``\\n``.
+
+    Raises:
+        ConfigError: not UTF-8, begins with a byte order mark, or has the line ends of an old Macintosh.
+    """
+    for mark, name in _MARKS.items():
+        if raw.startswith(mark):
+            raise ConfigError(path, [f"{path}:1: begins with {name}, not TOML. Save it as UTF-8 without such a mark"])
+    try:
+        text = raw.decode("utf-8").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
-        raise ConfigError(path, [f"{path}: not UTF-8 text at byte {error.start}. Save it as UTF-8"]) from None
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise ConfigError(path, [f"{path}:{line}: not UTF-8 text at byte {error.start}. Save it as UTF-8"]) from None
+    if "\r" in text:
+        line = text.count("\n", 0, text.index("\r")) + 1
+        cause = "a carriage return without a line feed, which ends no line in TOML"
+        raise ConfigError(path, [f"{path}:{line}: {cause}. Save it with the line ends of Unix or Windows"])
+    return text
+
+
+def parse_text(text: str, path: Path) -> Config:
+    """Check the text of a configuration file.
+
+    Raises:
+        ConfigError: not TOML, or not a valid configuration.
+    """
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -115,7 +151,7 @@ def _line_of(text: str, location: list[str]) -> int:
     """Line number of the key, 0 where it cannot be told. TOML parsers keep none, so the text is searched."""
     key, table = location[-1] if location else "", _dotted(location[:-1])
     current = ""
-    for number, raw in enumerate(text.splitlines(), 1):
+    for number, raw in enumerate(text.split("\n"), 1):
         line = raw.strip()
         if line.startswith("["):
             current = line.strip("[]").strip()

@@ -1,25 +1,22 @@
 """Brings an older configuration file up to date: ``python -m graderd.config.migrate FILE``.
 
 The package calls it at every upgrade. A file that is already up to date is not touched. Otherwise the former file is
-kept beside it as ``NAME.YYYYMMDD-HHMMSS.bak``, comments and order survive, the result is checked before anything is
-written, and the new file takes the old one's place in one step, with its owner and rights.
+kept beside it, comments and order survive, and :mod:`graderd.config.rewrite` sees to the rest.
 """
 
 from __future__ import annotations
 
-import os
-import shutil
 import sys
 from collections.abc import Callable, Mapping, MutableMapping
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
-from graderd.config.loader import ConfigError, parse
+from graderd.config.loader import ConfigError
 from graderd.config.models import Config
+from graderd.config.rewrite import rewrite
 
 CURRENT_VERSION: Final[int] = Config.model_fields["version"].default
 
@@ -190,27 +187,13 @@ def migrate_file(path: Path, steps: Mapping[int, Step] = STEPS) -> tuple[Path | 
     Raises:
         ConfigError: unreadable, or the result would not be a valid configuration; the file is as it was.
     """
-    try:
-        old = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(path, [f"{path}: cannot be read ({error}). Check the file"]) from None
-    try:
-        new, changes = migrate_text(old, steps)
-        parse(tomlkit.parse(new).unwrap(), path, new)
-    except ConfigError as error:
-        raise ConfigError(path, [line if str(path) in line else f"{path}: {line}" for line in error.problems]) from None
-    if new == old:
-        return None, []
-    backup = path.with_name(f"{path.name}.{datetime.now(UTC):%Y%m%d-%H%M%S}.bak")
-    shutil.copy2(path, backup)
-    temporary = path.with_name(f".{path.name}.new")
-    temporary.write_text(new, encoding="utf-8")
-    shutil.copystat(path, temporary)
-    was = path.stat()
-    os.chown(temporary, was.st_uid, was.st_gid)
-    os.chown(backup, was.st_uid, was.st_gid)
-    temporary.replace(path)
-    return backup, changes
+    changes: list[str] = []
+
+    def migrated(text: str) -> str:
+        new, changes[:] = migrate_text(text, steps)
+        return new
+
+    return rewrite(path, migrated), changes
 
 
 def main() -> int:

@@ -66,7 +66,7 @@ class RecordingSettings(Settings):
 
     directory: str = Field("", description="empty: nothing is recorded")
     rate_hz: Positive = Field(10.0, le=50)
-    max_mb: NotNegative = Field(500.0, description="oldest recordings go first")
+    max_mb: NotNegative = Field(500.0, description="oldest go first, incidents last")
     min_free_mb: NotNegative = Field(200.0, description="recording pauses below this; control goes on")
 
 

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from graderd.core.axes import JogName
+from graderd.hal.text import printable
+
+ClientText = Annotated[str, AfterValidator(printable)]
+"""What a client writes and others read: in status, log, journal, records and on their terminals. Made printable where
+it comes in, so that nobody further on has to think of it."""
 
 
 class _Command(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    client: str = Field("", max_length=80, description="who asks; one client commands at a time")
+    client: ClientText = Field("", max_length=80, description="who asks; one client commands at a time")
 
 
 class Arm(_Command):
@@ -31,7 +36,7 @@ class Stop(_Command):
     """End motion at once and latch. Wins over everything; idempotent."""
 
     command: Literal["stop"] = "stop"
-    reason: str = Field("stop command", max_length=200)
+    reason: ClientText = Field("stop command", max_length=200)
 
 
 class Reset(_Command):
@@ -70,7 +75,7 @@ class Preset(_Command):
     """Move to a named pose from the configuration while the lease is renewed."""
 
     command: Literal["preset"] = "preset"
-    name: str = Field(max_length=80)
+    name: ClientText = Field(max_length=80)
 
 
 class Renew(_Command):

@@ -10,6 +10,7 @@ from typing import Protocol
 
 from graderd.config import Config
 from graderd.core import commands as cmd
+from graderd.core.machine import ARMED, Mode, State
 from graderd.core.plausibility import motion_figures
 from graderd.core.soil import SoilObservation
 from graderd.core.tick import AxisSensed, AxisTick, Controller, Sensed, Tick, TickSettings
@@ -86,6 +87,7 @@ class ControlLoop:
         self._power = PowerSequencer(devices)
         self._queue: deque[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = deque()
         self._refused: dict[str, str] = {}
+        self._keep_last_stop = False
         self.sensed = self._sense(())
         self.tick = self._controller.step(self.sensed)
 
@@ -110,6 +112,14 @@ class ControlLoop:
                     cmd.Reply(command=queued.command, accepted=False, message="a stop came first", remedy=STOP_REMEDY)
                 )
         return reply
+
+    def end(self, reason: str) -> bool:
+        """Stop because the daemon ends, and say whether that ended an armed machine's work. Where it did not, what
+        stopped the machine last is still told after a restart."""
+        interrupts = self.tick.state.mode in ARMED
+        self._keep_last_stop = not interrupts
+        self.stop_now(cmd.Stop(reason=reason))
+        return interrupts
 
     # ---- the tick -------------------------------------------------------------------------------------------------
 
@@ -140,11 +150,18 @@ class ControlLoop:
         before = self.tick.state
         self.sensed = self._sense(commands, late_s)
         self.tick = self._controller.step(self.sensed)
-        after = self.tick.state
-        if before.mode is not after.mode:
-            log.info("%s -> %s: %s", before.mode, after.mode, after.reason)
+        if before.mode is not self.tick.state.mode:
+            self._tell_transition(before.mode, self.tick.state)
         self._act(self.tick)
         return self.tick.replies
+
+    def _tell_transition(self, before: Mode, after: State) -> None:
+        """Who or what changed the mode stands in fields of its own beside the text."""
+        obeyed = (c for c, reply in zip(self.sensed.commands, self.tick.replies, strict=True) if reply.accepted)
+        client = next((command.client for command in obeyed if command.client), "")
+        fault = next((f.name for f in self.tick.faults if after.reason.startswith(f"{f.name}: ")), "")
+        fields = {"event": True, "mode": after.mode, "client": client, "fault": fault}
+        log.info("%s -> %s: %s", before, after.mode, after.reason, extra=fields)
 
     def _sense(self, commands: tuple[cmd.Command, ...], late_s: float = 0.0) -> Sensed:
         """Everything that is known now; each device is asked once."""
@@ -175,7 +192,8 @@ class ControlLoop:
         """Hand what was decided to the devices."""
         if tick.stopped_now:
             self._hold_all()
-            self.last_stop = self._state_file.save(tick.state.reason)
+            if not self._keep_last_stop:
+                self.last_stop = self._state_file.save(tick.state.reason)
         self._power.want(tick.intents.power)
         for axis, decided in tick.axes.items():
             self._tell(axis, decided)
@@ -201,4 +219,5 @@ class ControlLoop:
     def _hold_all(self) -> None:
         """The stop path: every axis is told, whatever one of the drivers does."""
         for name in self._devices.hold_all():
-            log.error("%s: its driver failed to take the hold; its own dead man ends the motion", name)
+            fields = {"device": name}
+            log.error("%s: its driver failed to take the hold; its own dead man ends the motion", name, extra=fields)

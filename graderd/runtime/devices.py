@@ -131,7 +131,7 @@ class PowerSequencer:
                     await device.disarm()  # left over from before: arming anew writes and verifies everything
                 await device.arm()
             except DeviceError as error:
-                log.warning("arming %s failed: %s", name, error)
+                log.warning("arming %s failed: %s", name, error, extra={"event": True, "device": name})
                 self._error = str(error)
                 return
 
@@ -144,7 +144,7 @@ class PowerSequencer:
                     await device.disarm()
             except DeviceError as error:
                 # The device keeps its own dead man; the fault it reports says the rest.
-                log.warning("disarming %s failed: %s", name, error)
+                log.warning("disarming %s failed: %s", name, error, extra={"event": True, "device": name})
 
     async def close(self) -> None:
         """End the task under way."""
@@ -160,7 +160,7 @@ async def _finished(task: asyncio.Task[None] | None) -> None:
 
 
 async def open_devices(devices: Devices) -> None:
-    """Open the bus, then all axes side by side; every failure is told once per cause and tried again."""
+    """Open the bus, then all axes side by side. What fails is told and tried again; the log repeats it more rarely."""
     async with asyncio.TaskGroup() as group:
         group.create_task(_keep_trying("rotation", devices.rotation.open, devices.problems), name="open-rotation")
         group.create_task(_open_bus(devices), name="open-can")
@@ -178,11 +178,10 @@ async def _keep_trying(name: str, open_device: Callable[[], Awaitable[None]], pr
         try:
             await open_device()
         except DeviceError as error:
-            if problems.get(name) != str(error):
-                log.warning("%s: cannot be opened: %s", name, error)
-                problems[name] = str(error)
+            log.warning("%s: cannot be opened: %s", name, error, extra={"device": name})
+            problems[name] = str(error)
             await asyncio.sleep(RETRY_S)
         else:
             problems.pop(name, None)
-            log.info("%s: open", name)
+            log.info("%s: open", name, extra={"device": name})
             return

@@ -46,10 +46,15 @@ BACK_OFF_S = (0.5, 1.0, 2.0, 5.0, 10.0)
 RESTART_SHOWN_S = 5.0
 FUTURE_S = 0.1
 """Both processes read one clock; a frame further ahead of it than this is none."""
+COMPLAINTS_S = 0.5
+COMPLAINTS_EVERY_S = 0.01
+COMPLAINTS_BYTES = 65_536
+COMPLAINTS_N = 20
 MAX_LINE_BYTES = 8 * 1024 * 1024
 MAX_UNSENT_BYTES = 64 * 1024
 
 log = logging.getLogger(__name__)
+_FIELDS = {"device": "camera"}
 
 
 class PerceptionSupervisor:
@@ -204,7 +209,7 @@ class PerceptionSupervisor:
                 restart = "worker_hung" if self._killed_hung else "worker_restarted"
                 self._worker_faults.tell(restart, f"restart {self._restarts_n}", self._clock.now_s(), RESTART_SHOWN_S)
                 pause_s = self._back_off_s[min(self._opens_without_frame_n, len(self._back_off_s)) - 1]
-                log.warning("perception worker ended (restart %d in %.1f s)", self._restarts_n, pause_s)
+                log.warning("perception worker ended (restart %d in %.1f s)", self._restarts_n, pause_s, extra=_FIELDS)
                 await asyncio.sleep(pause_s)
         finally:
             await self._kill()
@@ -215,7 +220,11 @@ class PerceptionSupervisor:
         self._last_word_s = self._clock.now_s() + self._start_grace_s - self._camera.restart_s
         starting = asyncio.ensure_future(
             asyncio.create_subprocess_exec(
-                *self._command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=MAX_LINE_BYTES
+                *self._command,
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.PIPE,
+                limit=MAX_LINE_BYTES,
             )
         )
         try:
@@ -228,11 +237,18 @@ class PerceptionSupervisor:
         start = self._start.model_copy(update={"reset_first": reset_first})
         self._process.stdin.write(start.model_dump_json().encode() + b"\n")
         self._killed_hung = False
+        assert self._process.stderr is not None
+        complaints = asyncio.create_task(_log_complaints(self._process.stderr), name="perception-complaints")
         try:
             while await self._one_line(self._process.stdout):
                 pass
         finally:
-            await self._kill()
+            try:
+                await self._kill()
+                # Dead, its pipe ends by itself, unless a process that it left behind holds it.
+                await asyncio.wait((complaints,), timeout=COMPLAINTS_S)
+            finally:
+                complaints.cancel()
 
     async def _one_line(self, lines: asyncio.StreamReader) -> bool:
         """Handle the child's next line. False: it ended, spoke nonsense or has been silent for too long."""
@@ -242,10 +258,10 @@ class PerceptionSupervisor:
                 line = await lines.readline()
         except TimeoutError:
             self._killed_hung = True
-            log.warning("perception worker said nothing for %.1f s: killing it", self._camera.restart_s)
+            log.warning("perception worker said nothing for %.1f s: killing it", self._camera.restart_s, extra=_FIELDS)
             return False
         except ValueError:
-            log.warning("perception worker sent an overlong line: killing it")
+            log.warning("perception worker sent an overlong line: killing it", extra=_FIELDS)
             return False
         if not line:
             return False
@@ -256,7 +272,7 @@ class PerceptionSupervisor:
         except ValueError as error:  # pydantic's ValidationError is one
             detail = str(error).splitlines()[0]
             self._nonsense.tell("perception_nonsense", detail, self._clock.now_s(), RESTART_SHOWN_S)
-            log.warning("perception worker sent what cannot be true (%s): killing it", detail)
+            log.warning("perception worker sent what cannot be true (%s): killing it", detail, extra=_FIELDS)
             return False
 
     def _take(self, message: Opened | Observed | CameraProblem | Preview | Saved) -> bool:
@@ -272,10 +288,9 @@ class PerceptionSupervisor:
         elif isinstance(message, Opened):
             self._opened, self._problem = message, None
             self._opened_s = self._last_word_s
-            log.info("camera open: %s", message.description)
+            log.info("camera open: %s", message.description, extra=_FIELDS)
         elif isinstance(message, CameraProblem):
-            if self._problem is None or self._problem.message != message.message:
-                log.warning("camera: %s", message.message)
+            log.warning("camera: %s", message.message, extra={**_FIELDS, "fault": f"camera.{message.condition}"})
             self._problem = message
             # Alive but without frames for too long: the ladder goes on all the same. The time a child took to start
             # does not count against it, or none that starts slowly would ever get to its first frame.
@@ -301,3 +316,13 @@ class PerceptionSupervisor:
         # Forgotten only when it is reaped: cancelled while waiting here, run() comes here again.
         await process.wait()
         self._process = None
+
+
+async def _log_complaints(stream: asyncio.StreamReader) -> None:
+    """What the child and the libraries in it print on standard error, through our log: a child that fails at every
+    start would else fill the journal past all its limits. Of a torrent, each piece's first and last lines are told."""
+    while data := await stream.read(COMPLAINTS_BYTES):
+        lines = [line for line in data.decode("utf-8", "replace").splitlines() if line.strip()]
+        for line in lines if len(lines) <= 2 * COMPLAINTS_N else lines[:COMPLAINTS_N] + lines[-COMPLAINTS_N:]:
+            log.warning("perception worker: %s", line, extra=_FIELDS)
+        await asyncio.sleep(COMPLAINTS_EVERY_S)

@@ -9,7 +9,7 @@ from typing import Any
 
 from graderd.api.port import ServiceError
 from graderd.config import Config
-from graderd.core.commands import Command, Reply
+from graderd.core.commands import Command, Reply, Stop
 from graderd.core.machine import Mode
 from graderd.core.status import Status
 from graderd.hal.errors import DeviceError
@@ -70,7 +70,10 @@ class Port:
 
     async def command(self, command: Command) -> Reply:
         """Hand a command to the next tick; stop acts at once."""
-        return await self._loop.command(command)
+        reply = await self._loop.command(command)
+        if isinstance(command, Stop):
+            self._cached = None  # it acted between two ticks: who asks now sees the machine stopped
+        return reply
 
     def config(self) -> dict[str, Any]:
         """The resolved configuration."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import socket
 
+from graderd.hal.text import printable
+
 
 class SystemdNotifier:
     """Sends datagrams to ``$NOTIFY_SOCKET``. The watchdog is fed by the control tick and by nothing else."""
@@ -29,11 +31,11 @@ class SystemdNotifier:
 
     def ready(self, status: str) -> None:
         """The service is up."""
-        self._send(f"READY=1\nSTATUS={status}")
+        self._send(f"READY=1\nSTATUS={printable(status)}")
 
     def status(self, text: str) -> None:
-        """One line for ``systemctl status``."""
-        self._send(f"STATUS={text}")
+        """One line for ``systemctl status``: a line end in it would begin another assignment."""
+        self._send(f"STATUS={printable(text)}")
 
     def feed_watchdog(self) -> None:
         """The control tick is alive."""

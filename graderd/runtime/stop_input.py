@@ -84,9 +84,11 @@ class StopInputWatch:
         while not self._ending.is_set():
             try:
                 self._source.open()
-                log.info("stop input: %s", self._source.where)
+                log.info("stop input: %s", self._source.where, extra={"device": DEVICE})
                 self._look_on(loop)
             except DeviceError as error:
+                # At every attempt: the log repeats it ever more rarely.
+                log.warning("stop input: %s", error, extra={"device": DEVICE, "fault": f"{DEVICE}.lost"})
                 self._say(loop, "lost", str(error))
                 self._ending.wait(RETRY_S)
         self._source.close()
@@ -117,7 +119,9 @@ class StopInputWatch:
         if condition == former.condition:
             return
         if condition:
-            log.warning("stop input: %s", detail)
+            if condition != "lost":
+                fields = {"event": True, "device": DEVICE, "fault": f"{DEVICE}.{condition}"}
+                log.warning("stop input: %s", detail, extra=fields)
             try:
                 loop.call_soon_threadsafe(self._on_stop, detail)
             except RuntimeError:

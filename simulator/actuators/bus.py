@@ -10,6 +10,7 @@ from typing import Final, Literal
 
 import can
 
+from graderd.drivers.j1939.bus_health import ERROR_FRAMES, BusEvent
 from graderd.drivers.j1939.ids import Frame
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import DeviceMissingError
@@ -22,12 +23,15 @@ from graderd.simulator.actuators.wire import Listener, Wire, WireBus
 _TICK_S: Final = 0.005
 _BUS_FAULTS: Final = (
     "adapter_hung",
+    "adapter_refuses",
+    "adapter_resets",
     "address_conflict",
     "bus_off",
     "claim_storm",
     "error_passive",
     "flood",
     "overrun",
+    "self_reception",
 )
 BusState = Literal["bus_off", "error_passive", "error_active", "overrun"]
 _STATE_LINES: Final[dict[BusState, bytes]] = {
@@ -37,13 +41,12 @@ _STATE_LINES: Final[dict[BusState, bytes]] = {
     "overrun": b"e1o",
 }
 """State and error lines as the kernel's slcan driver reads them from an adapter."""
-_ERROR_FRAMES: Final[dict[BusState, tuple[int, bytes]]] = {
-    "bus_off": (0x40, bytes(8)),
-    "error_passive": (0x04, bytes((0, 0x30, 0, 0, 0, 0, 128, 128))),
-    "error_active": (0x04, bytes((0, 0x40, 0, 0, 0, 0, 0, 0))),
-    "overrun": (0x04, bytes((0, 0x01, 0, 0, 0, 0, 0, 0))),
+_EVENTS: Final[dict[BusState, BusEvent]] = {
+    "bus_off": BusEvent.BUS_OFF,
+    "error_passive": BusEvent.ERROR_PASSIVE,
+    "error_active": BusEvent.ERROR_ACTIVE,
+    "overrun": BusEvent.QUEUE_OVERRUN,
 }
-"""Error frames as the Linux kernel reports them (linux/can/error.h): class bits and data."""
 
 
 class VirtualActuatorBus:
@@ -164,7 +167,9 @@ class VirtualActuatorBus:
         Bus faults and their parameters: ``flood`` rate_hz 2000; ``address_conflict`` at_address 231: a controller
         with our own NAME; ``claim_storm`` at_address 231, rate_hz 200, wins 1: a controller who claims without end, and
         whose NAME wins (0: loses) every arbitration; ``bus_off``, ``error_passive``, ``overrun``: as the adapter or
-        kernel reports them; ``adapter_hung``: the adapter no longer reads.
+        kernel reports them; ``adapter_hung``: the adapter no longer reads; ``adapter_refuses``: it answers NACK to
+        every frame; ``adapter_resets`` boot_s 0: it forgets its channel, and from the next time its port is opened on
+        boots so long; ``self_reception``: the host gets its own frames back.
 
         Raises:
             ValueError: no such fault, or no unit at that address.
@@ -190,6 +195,8 @@ class VirtualActuatorBus:
             case "adapter_hung":
                 if self._adapter is not None:
                     self._adapter.set_deaf(True)
+            case "adapter_refuses" | "adapter_resets" | "self_reception":
+                self._disturb_adapter(fault, params.get("boot_s", 0.0))
             case "bus_off" | "error_passive" | "overrun":
                 self.report_state(fault)
 
@@ -201,13 +208,15 @@ class VirtualActuatorBus:
         self._rival = None
         if self._adapter is not None:
             self._adapter.set_deaf(False)
+            self._adapter.refusing = self._adapter.echoing = False
+            self._adapter.boot_s = 0.0
         self.report_state("error_active")
 
     def report_state(self, state: BusState) -> None:
         """Tell the hosts a controller state: an slcan line, or a kernel-style error frame for in-process buses."""
         if self._adapter is not None:
             self._adapter.send_line(_STATE_LINES[state])
-        class_bits, data = _ERROR_FRAMES[state]
+        class_bits, data = ERROR_FRAMES[_EVENTS[state]]
         for bus in self._buses:
             bus.deliver(can.Message(arbitration_id=class_bits, data=data, is_error_frame=True, is_extended_id=False))
 
@@ -229,6 +238,18 @@ class VirtualActuatorBus:
                     for frame in peer.advance(now_s):
                         self.wire.send(frame, self._on_rival)
             await asyncio.sleep(_TICK_S)
+
+    def _disturb_adapter(self, fault: str, boot_s: float) -> None:
+        if self._adapter is None:
+            return
+        match fault:
+            case "adapter_refuses":
+                self._adapter.refusing = True
+            case "adapter_resets":
+                self._adapter.boot_s = boot_s
+                self._adapter.reset()
+            case "self_reception":
+                self._adapter.echoing = True
 
     def _hearer_of(self, unit: VirtualElectrak) -> Listener:
         def hear(frame: Frame) -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
-import pty
-import tty
 from pathlib import Path
 from typing import Final
 
 from graderd.drivers.j1939.ids import Frame
 from graderd.simulator.actuators.wire import Wire
+from graderd.simulator.terminal import LinkedTerminal
 
 _OK: Final = b"\r"
 _ERROR: Final = b"\a"
@@ -27,13 +25,21 @@ class SlcanAdapter:
     def __init__(self, wire: Wire, link: Path) -> None:
         self._wire = wire
         self._link = link
-        self._master_fd = self._slave_fd = -1
+        self._terminal: LinkedTerminal | None = None
+        self._master_fd = -1
         self._open = False
         self._listen_only = False
         self._line = bytearray()
         self._unsent = b""
         self._deaf = False
         self._bitrate_code = b""
+        self._booted_at_s: float | None = None
+        self.boot_s = 0.0
+        """A board that resets when its port is opened: so long after the first byte it hears nothing."""
+        self.refusing = False
+        """Whether every frame is answered NACK."""
+        self.echoing = False
+        """Whether the host gets its own frames back, as self-reception does."""
         self.dropped_n = 0
         """Frames lost because the host did not read."""
         self.commands: list[str] = []
@@ -54,31 +60,28 @@ class SlcanAdapter:
         """Create the terminal and point the link to it."""
         if self.plugged:
             return
-        self._master_fd, self._slave_fd = pty.openpty()
-        tty.setraw(self._slave_fd)
-        os.set_blocking(self._master_fd, False)
-        temporary = self._link.with_name(self._link.name + ".new")
-        with contextlib.suppress(FileNotFoundError):
-            temporary.unlink()
-        temporary.symlink_to(os.ttyname(self._slave_fd))
-        temporary.replace(self._link)
+        self._terminal = LinkedTerminal(self._link)
+        self._master_fd = self._terminal.master
         asyncio.get_running_loop().add_reader(self._master_fd, self._on_readable)
         self._wire.attach(self._hear)
 
     def unplug(self) -> None:
         """Take the terminal away: the host sees a hang-up, the link is gone."""
-        if not self.plugged:
+        if self._terminal is None:
             return
         self._wire.detach(self._hear)
         asyncio.get_running_loop().remove_reader(self._master_fd)
-        os.close(self._master_fd)
-        os.close(self._slave_fd)
-        self._master_fd = self._slave_fd = -1
+        self._terminal.close()
+        self._terminal, self._master_fd = None, -1
         self._open = False
+        self._booted_at_s = None
         self._unsent = b""
         self._line.clear()
-        with contextlib.suppress(FileNotFoundError):
-            self._link.unlink()
+
+    def reset(self) -> None:
+        """Forget that the channel is open, as a board does whose supply failed for a moment."""
+        self._open = False
+        self._line.clear()
 
     def set_deaf(self, deaf: bool) -> None:
         """Stop reading what the host sends, as a hung adapter does; its buffer then fills up."""
@@ -126,6 +129,11 @@ class SlcanAdapter:
         try:
             data = os.read(self._master_fd, 4096)
         except (BlockingIOError, OSError):
+            return
+        now_s = asyncio.get_running_loop().time()
+        if self._booted_at_s is None:
+            self._booted_at_s = now_s + self.boot_s
+        if now_s < self._booted_at_s:
             return
         for byte in data:
             if byte == 0x0D:
@@ -179,10 +187,12 @@ class SlcanAdapter:
             data = bytes.fromhex(line[2 + digits : 2 + digits + 2 * length].decode("ascii"))
         except (ValueError, UnicodeDecodeError):
             return _ERROR
-        if not self._open or self._listen_only or length > 8:
+        if not self._open or self._listen_only or length > 8 or self.refusing:
             return _ERROR
         if line[:1] in b"tT":
             if len(data) != length:
                 return _ERROR
             self._wire.send(Frame(can_id, data, extended), self._hear)
+            if self.echoing:
+                self._write(line + _OK)
         return b"Z\r" if extended else b"z\r"

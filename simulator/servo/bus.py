@@ -7,7 +7,6 @@ import contextlib
 import functools
 import os
 import random
-import tty
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from graderd.simulator.servo.faults import ALERT_BITS, FAULTS
 from graderd.simulator.servo.line import answers
 from graderd.simulator.servo.servo import VirtualServo
 from graderd.simulator.servo.timing import baud_of, busy_until, pty_round_trip_s, wire_s
+from graderd.simulator.terminal import LinkedTerminal
 
 _TICK_S = 0.01
 _SPIN_S = 0.001
@@ -72,8 +72,8 @@ class VirtualServoBus:
         self._random = random.Random(seed)
         self._faults: dict[str, dict[str, float]] = {}
         self._decoder = StreamDecoder()
+        self._terminal: LinkedTerminal | None = None
         self._master = -1
-        self._slave = -1
         self._task: asyncio.Task[None] | None = None
         self._timers: set[asyncio.TimerHandle] = set()
         self._last_byte_s = 0.0
@@ -141,30 +141,18 @@ class VirtualServoBus:
         self._turn_s = now_s
 
     def _plug_in(self) -> None:
-        master, slave = os.openpty()
-        tty.setraw(slave)
-        tty.setraw(master)
-        os.set_blocking(master, False)
-        self._detour_s = pty_round_trip_s(master, slave) if self.wire_time else 0.0
-        # The slave stays open here: without one, reading the master would fail until a client comes.
-        self._master, self._slave = master, slave
+        terminal = LinkedTerminal(self.link)
+        self._detour_s = pty_round_trip_s(terminal.master, terminal.slave) if self.wire_time else 0.0
+        self._terminal, self._master = terminal, terminal.master
         self._decoder.reset()
-        asyncio.get_running_loop().add_reader(master, self._on_readable)
-        partial = self.link.with_name(f".{self.link.name}.{os.getpid()}")
-        with contextlib.suppress(FileNotFoundError):
-            partial.unlink()
-        partial.symlink_to(os.ttyname(slave))
-        partial.replace(self.link)
+        asyncio.get_running_loop().add_reader(self._master, self._on_readable)
 
     def _pull_out(self) -> None:
-        if self._master < 0:
+        if self._terminal is None:
             return
         asyncio.get_running_loop().remove_reader(self._master)
-        with contextlib.suppress(FileNotFoundError):
-            self.link.unlink()
-        os.close(self._slave)
-        os.close(self._master)
-        self._master = self._slave = -1
+        self._terminal.close()
+        self._terminal, self._master = None, -1
 
     # -- faults -------------------------------------------------------------------------------------------------
 
@@ -267,7 +255,7 @@ class VirtualServoBus:
         now_s = self._clock.now_s()
         if "echo" in self._faults:
             self._put(data)
-        if self._strict_baud and baud_of(self._slave) != self.baud_n:
+        if self._strict_baud and self._terminal and baud_of(self._terminal.slave) != self.baud_n:
             return
         if self._decoder.pending_n and now_s - self._last_byte_s > self._byte_gap_s:
             self._decoder.reset()

@@ -18,9 +18,9 @@ from graderd.hal.camera import Camera, Frame
 from graderd.hal.settings import CameraSettings
 from graderd.perception import CameraCalibration
 from graderd.perception.frame_set import Entry, FrameSetCamera, FrameSetWriter
+from harness.realsense_devices import Color, Depth, SoftD455, record
 from tests.contract.conformance import CameraConformance, CameraStand
 from tests.contract.test_realsense_live import both, settings, streaming
-from tests.realsense_devices import Color, Depth, SoftD455, record
 from tests.rig_process import running_rig
 
 FRAMES_N = 4

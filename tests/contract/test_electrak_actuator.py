@@ -27,7 +27,7 @@ from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 from tests.contract.conformance import ActuatorStand, LinearActuatorConformance, state
 from tests.electrak_sim import until
 

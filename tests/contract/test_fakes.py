@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from graderd.hal.clock import Clock, ManualClock, SystemClock
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 from tests.contract.conformance import (
     ActuatorStand,
     ClockConformance,

@@ -14,7 +14,7 @@ from graderd.core.soil import Zone
 from graderd.hal.camera import Frame
 from graderd.perception import METHODS, CameraCalibration, Method, PerceptionSettings
 from graderd.perception.classifier import make_classifier
-from tests.perception_scenes import Scene, render
+from harness.perception_scenes import Scene, render
 
 PILES = [Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN, Zone.NONE]
 

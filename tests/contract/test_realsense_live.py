@@ -19,7 +19,7 @@ from graderd.hal.errors import (
     WrongDeviceError,
 )
 from graderd.hal.settings import CameraSettings
-from tests.realsense_devices import SoftD455
+from harness.realsense_devices import SoftD455
 
 PERIOD_S = 1 / 30
 

@@ -45,7 +45,7 @@ from graderd.hal.service import DeviceService
 from graderd.hal.settings import CanSettings, Positive, RotatorSettings, Settings
 from graderd.runtime.app.backends import check_plugins, rotator_of
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 from tests.contract.conformance import RotatorConformance, RotatorStand
 
 NAME: Final = f"{__name__}:VALVE"
@@ -188,6 +188,10 @@ class ValveRotator:
         flow = self._flow_percent(now_s)
         self._flowing = flow != 0.0
         return command(self._own.valve_n, source, flow)
+
+    def stop_frame(self, source: int, now_s: float) -> Frame | None:
+        flowed, self._flowing = self._flowing, False
+        return command(self._own.valve_n, source, 0.0) if flowed else None
 
     def on_feedback(self, data: bytes, now_s: float) -> None:
         angle_deg = int.from_bytes(data[:2], "little") / 100.0 - 180.0

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from graderd.client import Client
 from graderd.core.status import Status
 from hil import bench
-from hil.service import Api
 from tests.machine import machine
 
 pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(240)]
@@ -36,8 +36,8 @@ async def test_every_motion_is_asked_for_and_measured(tmp_path: Path, monkeypatc
 
     async with machine(tmp_path) as whole:
         await whole.until(at_rest)
-        api = Api(tmp_path / "graderd.sock")
-        session = bench.Bench(api, yes)
+        client = Client(tmp_path / "graderd.sock")
+        session = bench.Bench(client, yes)
         await asyncio.to_thread(session.run)
         assert {r.name: r.outcome for r in session.results} == {
             "stop latches": "ok",
@@ -64,7 +64,7 @@ async def test_every_motion_is_asked_for_and_measured(tmp_path: Path, monkeypatc
         assert 0.0 < float(figures["stop in motion"]["further_deg"]) < 5.0
         state = await whole.status()
         assert state.mode == "disarmed"
-        written = json.loads(bench.write_report(session.results, api.status()).read_text(encoding="utf-8"))
+        written = json.loads(bench.write_report(session.results, client.get("/v1/status")).read_text(encoding="utf-8"))
         assert written["simulated"] is True
         assert len(written["results"]) == len(session.results)
 
@@ -72,7 +72,7 @@ async def test_every_motion_is_asked_for_and_measured(tmp_path: Path, monkeypatc
 async def test_nothing_moves_where_the_person_does_not_say_yes(tmp_path: Path) -> None:
     async with machine(tmp_path) as whole:
         before = await whole.until(at_rest)
-        session = bench.Bench(Api(tmp_path / "graderd.sock"), lambda _: "y")
+        session = bench.Bench(Client(tmp_path / "graderd.sock"), lambda _: "y")
         await asyncio.to_thread(session.run)
         assert [r.outcome for r in session.results].count("skipped") == 7
         after = await whole.status()

@@ -13,10 +13,10 @@ import pytest
 
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import catalogue_key
-from tests.fault.campaign.__main__ import CASES, about, chosen, joined
-from tests.fault.campaign.daemon import BREAKS
-from tests.fault.campaign.model import Outcome, Phase
-from tests.fault.campaign.page import write
+from harness.campaign.__main__ import CASES, about, chosen, joined
+from harness.campaign.daemon import BREAKS
+from harness.campaign.model import Outcome, Phase
+from harness.campaign.page import write
 
 SHORT_S = 240.0
 KEYS = {
@@ -27,7 +27,7 @@ KEYS = {
 async def campaign(*arguments: str) -> tuple[int, list[dict[str, Any]]]:
     """Run it as ``make faults`` does; status and results of its last line."""
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "tests.fault.campaign", "--json", *arguments),
+        *(sys.executable, "-m", "harness.campaign", "--json", *arguments),
         stdout=asyncio.subprocess.PIPE,
         env=os.environ.copy(),
     )

@@ -8,12 +8,14 @@ import errno
 import functools
 import socket
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import can
 import pytest
 
-from graderd.drivers.electrak import CanLink, ElectrakActuator, dump
+from graderd.drivers.electrak import CanLink, ElectrakActuator, dump, safe_off
+from graderd.drivers.j1939 import link as link_module
 from graderd.drivers.j1939.bus_health import BusEvent, event_of
 from graderd.drivers.j1939.can_port import PortLostError, SlcanPort, SocketCanPort, lost_from
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of
@@ -21,6 +23,7 @@ from graderd.drivers.j1939.slcan_bus import QuietSlcanBus
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
+from graderd.simulator.actuators.slcan import SlcanAdapter
 from tests.electrak_sim import conditions, state, until
 
 # -- the slcan adapter, in real time ----------------------------------------------------------------------------------
@@ -103,6 +106,81 @@ async def test_a_hung_adapter_fills_the_queue_and_never_blocks_the_loop(tmp_path
         bus.clear_faults()
         await asyncio.sleep(0.3)
         assert link.is_open
+
+
+async def test_an_adapter_that_refuses_is_told_and_counted_and_one_refusal_is_not(tmp_path: Path) -> None:
+    async with slcan_machine(tmp_path) as (bus, link, axis):
+        assert link.counters.refused_n == 0, "what is refused while it is opened is no news"
+        bus.send_adapter_line(b"\a")
+        await until(lambda: link.counters.refused_n == 1)
+        assert conditions(link) == set()
+        bus.inject("adapter_refuses")
+        await until(lambda: "adapter_refuses" in conditions(link))
+        assert link.counters.refused_n >= 5
+        bus.clear_faults()
+        await until(lambda: conditions(link) == set())
+        await until(lambda: state(axis) is Lifecycle.STANDBY)
+
+
+async def test_an_adapter_that_forgot_its_channel_is_opened_again(tmp_path: Path) -> None:
+    async with slcan_machine(tmp_path) as (bus, link, axis):
+        bus.inject("adapter_resets")
+        await until(lambda: "adapter_refuses" in conditions(link))
+        await until(lambda: bus.channel_open)
+        await until(lambda: conditions(link) == set() and state(axis) is Lifecycle.STANDBY)
+        assert link.counters.lost_n == 0
+
+
+async def test_a_board_that_resets_when_its_port_is_opened_is_waited_for(tmp_path: Path) -> None:
+    unit = VirtualElectrak(position_mm=100.0, seed=2)
+    bus = VirtualActuatorBus([unit], link=tmp_path / "can")
+    await bus.start()
+    bus.inject("adapter_resets", boot_s=1.2)
+    link = CanLink(CanSettings(interface="slcan", channel=str(tmp_path / "can")))
+    await link.open()
+    assert bus.channel_open
+    claimed_n = link.counters.tx_n
+    assert claimed_n == 2, "request and claim, none lost in its boot"
+    await link.close()
+    bus.unplug()
+    bus.replug()
+    assert await asyncio.to_thread(safe_off, link.settings, (19,)) == 8, "the guard too: before it booted, and after"
+    await bus.close()
+
+
+async def test_an_adapter_that_never_answers_is_used_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SlcanAdapter, "_answer", _mute(SlcanAdapter._answer))
+    monkeypatch.setattr(link_module, "READY_S", 0.2)
+    async with slcan_machine(tmp_path) as (_, link, axis):
+        assert conditions(link) == set()
+        assert state(axis) is Lifecycle.STANDBY
+
+
+def _mute(answer: Callable[[SlcanAdapter, bytes], bytes]) -> Callable[[SlcanAdapter, bytes], bytes]:
+    def without(adapter: SlcanAdapter, line: bytes) -> bytes:
+        answer(adapter, line)
+        return b""
+
+    return without
+
+
+async def test_self_reception_is_no_conflict_and_a_stranger_is(tmp_path: Path) -> None:
+    unit = VirtualElectrak(position_mm=100.0, seed=2)
+    bus = VirtualActuatorBus([unit], link=tmp_path / "can")
+    await bus.start()
+    bus.inject("self_reception")
+    link = CanLink(CanSettings(interface="slcan", channel=str(tmp_path / "can")))
+    axis = ElectrakActuator("lift_left", ElectrakSettings(), link)
+    await axis.open()
+    await until(lambda: link.counters.tx_n > 20)
+    assert conditions(link) == set()
+    bus.send(Frame(make_id(6, Pgn.PROPRIETARY_A, link.address or 0, 19), bytes(8)))
+    await until(lambda: conditions(link) == {"address_conflict"})
+    await axis.close()
+    await link.close()
+    await bus.close()
 
 
 # -- SocketCAN, by its frames and error numbers -----------------------------------------------------------------------

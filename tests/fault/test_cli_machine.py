@@ -98,7 +98,7 @@ async def test_the_bus_of_the_running_daemon_is_dumped_through_it(tmp_path: Path
     """Its serial adapter has one reader, and that is the daemon: frames of both directions, and nobody is disturbed."""
     async with machine(tmp_path) as whole:
         await whole.until(lambda s: all(s.axes[name].measured is not None for name in ("lift_left", "tilt")))
-        channel = (await whole.client.get("/v1/config")).json()["can"]["channel"]
+        channel = (await whole.client.config())["can"]["channel"]
         dumping = await start(tmp_path, "can", "dump", *([channel] if named else []), "--json")
         assert dumping.stdout is not None
         seen: set[tuple[str, int]] = set()

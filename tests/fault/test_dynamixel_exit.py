@@ -19,7 +19,7 @@ from graderd.hal.errors import DeviceMissingError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 from tests.dynamixel_sim import PATIENCE_S, bench, servo_process, until
 
 # A daemon in miniature: arms, turns for ever, says when it is under way.

@@ -35,6 +35,58 @@ async def test_the_demonstration_turns_the_blade_by_what_the_camera_sees() -> No
         assert measured_deg == pytest.approx(requested_deg, abs=0.5)
 
 
+async def test_two_demonstrations_beside_each_other_pass(tmp_path: Path) -> None:
+    """Two checkouts, or two users: nothing of one is the other's, whatever the place for run-time files."""
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+    demonstrations = [
+        await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "graderd", "demo", "--json"), stdout=asyncio.subprocess.PIPE, env=environment
+        )
+        for _ in range(2)
+    ]
+    for out, _ in await asyncio.gather(*(process.communicate() for process in demonstrations)):
+        last = json.loads(out.splitlines()[-1])
+        assert [one["decided"] for one in last["passes"]] == ["left", "center", "right", "even"], last
+    assert [process.returncode for process in demonstrations] == [0, 0]
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_a_demonstration_that_fails_says_why_in_its_last_event(tmp_path: Path) -> None:
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "graderd", "demo", "--json"),
+        stdout=asyncio.subprocess.PIPE,
+        env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},
+    )
+    assert process.stdout is not None
+    while json.loads(await process.stdout.readline())["event"] != "armed":
+        pass
+    (directory,) = tmp_path.iterdir()
+    os.kill(json.loads((directory / "rig.json").read_text())["pid"], signal.SIGKILL)
+    out, _ = await process.communicate()
+    last = json.loads(out.splitlines()[-1])
+    assert process.returncode == 1
+    assert last["event"] == "demo_finished"
+    assert last["passes"] == []
+    assert "control.sock" in last["reason"]
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_a_demonstration_ended_from_outside_says_so_and_leaves_nothing(tmp_path: Path) -> None:
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "graderd", "demo", "--json"),
+        stdout=asyncio.subprocess.PIPE,
+        env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},
+    )
+    assert process.stdout is not None
+    while json.loads(await process.stdout.readline()) != {"event": "starting", "what": "daemon"}:
+        pass
+    process.terminate()
+    out, _ = await process.communicate()
+    assert json.loads(out.splitlines()[-1]) == {"event": "demo_finished", "passes": [], "reason": "ended by SIGTERM"}
+    assert process.returncode == 1
+    assert list(tmp_path.iterdir()) == []
+
+
 async def test_the_servo_stops_by_its_own_watchdog_when_the_daemon_is_killed(tmp_path: Path) -> None:
     async with machine(tmp_path) as whole:
         await whole.turn()

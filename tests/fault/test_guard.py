@@ -7,6 +7,7 @@ no watchdog in the servo, far targets in the actuators. Then after a daemon that
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import sys
 import time
@@ -14,15 +15,17 @@ from pathlib import Path
 
 import pytest
 
+from graderd.config import load
 from graderd.drivers.dynamixel.calibration import Calibration
 from graderd.drivers.electrak.codec import Control, ElectrakCodec
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id
 from graderd.hal.settings import Ph54Settings
+from graderd.runtime.app.last_run import remember
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
-from tests.fault.campaign.conduct import EVERYTHING, come_to
-from tests.fault.campaign.model import Phase
-from tests.fault.campaign.stack import Stack
+from harness.campaign.conduct import EVERYTHING, come_to
+from harness.campaign.model import Phase
+from harness.campaign.stack import Stack
 
 ADDRESSES = {"lift_left": 19, "lift_right": 20, "tilt": 27}
 FAR = {"lift_left": 290.0, "lift_right": 290.0, "tilt": 95.0}
@@ -40,13 +43,25 @@ channel = "{can}"
 """
 
 
-async def run_guard(directory: Path, at_exit: str = "off") -> tuple[int, float]:
-    """The guard as the service calls it, on the wires in ``directory``; its status and how long it took."""
-    config = directory / "guard.toml"
+def configure(directory: Path, at_exit: str = "off", *, lost: bool = False) -> None:
+    """Write the guard's configuration for the wires in ``directory``. ``lost``: and spoil it after a daemon's start."""
+    path = directory / "guard.toml"
     text = GUARD_TOML.format(servo=directory / "servo", can=directory / "can", at_exit=at_exit)
-    config.write_text(text, encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
+    if lost:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("STATE_DIRECTORY", str(directory))
+            remember(load(path), path)
+        path.write_text("[rotation\n", encoding="utf-8")
+
+
+async def run_guard(directory: Path, *mistakes: str) -> tuple[int, float]:
+    """The guard as the service calls it; its status and how long it took."""
     began_s = time.monotonic()
-    process = await asyncio.create_subprocess_exec(sys.executable, "-m", "graderd", "guard", "--config", str(config))
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "graderd", "guard", "--config", str(directory / "guard.toml"), *mistakes),
+        env=os.environ | {"STATE_DIRECTORY": str(directory)},
+    )
     return await process.wait(), time.monotonic() - began_s
 
 
@@ -56,9 +71,9 @@ def tell(took_s: float, times_s: dict[str, float]) -> None:
     sys.stdout.write(f"the guard took {took_s:.2f} s; {figures}\n")
 
 
-@pytest.mark.parametrize("at_exit", ["off", "on"])
+@pytest.mark.parametrize(("at_exit", "lost"), [("off", False), ("on", False), ("on", True)])
 @pytest.mark.timeout(60)
-async def test_the_guard_alone_ends_motion_on_both_wires(tmp_path: Path, at_exit: str) -> None:
+async def test_the_guard_alone_ends_motion_on_both_wires(tmp_path: Path, at_exit: str, lost: bool) -> None:
     servo = VirtualServo()
     units = {
         name: VirtualElectrak("electrak_md_a050" if name == "tilt" else "electrak_hd_b017", address, 5.0)
@@ -84,13 +99,14 @@ async def test_the_guard_alone_ends_motion_on_both_wires(tmp_path: Path, at_exit
             await asyncio.sleep(0.005)
 
     watching = asyncio.create_task(watch(), name="watch")
+    configure(tmp_path, at_exit, lost=lost)
     try:
         await _set_off(servo, units, can_wire)
         await asyncio.sleep(0.5)
         assert abs(servo.shaft_velocity_deg_per_s) > 1.0
         assert all(abs(unit.velocity_mm_per_s) > 1.0 for unit in units.values())
         from_s = time.monotonic()
-        status, took_s = await run_guard(tmp_path, at_exit)
+        status, took_s = await run_guard(tmp_path, *(["--no-such-option"] if lost else []))
         await asyncio.sleep(STILL_S)
         stopped = {name: unit.position_mm for name, unit in units.items()} | {"rotation": servo.shaft_deg}
         await asyncio.sleep(0.5)
@@ -137,6 +153,7 @@ def _send(can_wire: VirtualActuatorBus, name: str, address: int, *, enable: bool
 @pytest.mark.serial_only
 @pytest.mark.timeout(180)
 async def test_the_guard_after_a_daemon_that_was_killed_in_mid_lift(tmp_path: Path) -> None:
+    configure(tmp_path)
     async with Stack(tmp_path) as stack:
         await come_to(stack, Phase.LIFTING)
         from_s = time.monotonic()

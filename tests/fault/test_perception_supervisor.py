@@ -8,6 +8,8 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
+import pytest
+
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Zone
 from graderd.hal.clock import SystemClock
@@ -147,3 +149,15 @@ async def test_cancelling_leaves_no_child(tmp_path: Path) -> None:
         await until(lambda: eyes.newest is not None)
         pid = int(starts(tmp_path)[-1].split('"pid": ')[1].split(",")[0])
     assert not Path(f"/proc/{pid}").exists()
+
+
+async def test_what_a_failing_child_prints_goes_through_the_log(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    body = 'sys.stderr.write("a torrent\\n" * 20_000); sys.stderr.flush(); raise RuntimeError("no camera")'
+    async with worker(tmp_path, body):
+        await until(lambda: any("RuntimeError: no camera" in record.getMessage() for record in caplog.records))
+    said = [record for record in caplog.records if "worker: a torrent" in record.getMessage()]
+    assert 0 < len(said) < 10_000, "of a torrent not all is told"
+    assert {record.__dict__["device"] for record in said} == {"camera"}
+    assert "a torrent" not in capfd.readouterr().err

@@ -59,6 +59,29 @@ def test_rig_announces_everything_at_once(tmp_path: Path) -> None:
         camera.close()
 
 
+def test_a_killed_rigs_links_never_lead_to_somebody_elses_terminal(tmp_path: Path) -> None:
+    """A daemon whose rig died tries its wires again and again; the kernel gives a terminal's number away at once."""
+    with running_rig(tmp_path / "rig") as (process, where):
+        links = [Path(where["servo"]), Path(where["can"]["channel"])]
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        others: list[int] = []
+        try:
+            deadline_s = time.monotonic() + 10.0
+            while any(link.is_symlink() for link in links):
+                assert time.monotonic() < deadline_s, "the links stay"
+                others += os.openpty()
+                for link in links:
+                    assert not link.exists() or not link.samefile(os.ttyname(others[-1]))
+                if len(others) > 64:
+                    time.sleep(0.01)
+                    for other in (others.pop(), others.pop()):
+                        os.close(other)
+        finally:
+            for other in others:
+                os.close(other)
+
+
 def test_rig_killed_takes_its_camera_along_and_clients_know_at_once(tmp_path: Path) -> None:
     with running_rig(tmp_path / "rig") as (process, where):
         camera_pid = rig_request(where["control"], "state")["camera_pid"]

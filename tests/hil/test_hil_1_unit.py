@@ -27,9 +27,9 @@ def test_exposure_is_low(unit: str) -> None:
 
 def test_it_starts_disarmed_and_says_so(service: Grader) -> None:
     assert service.unit.state == "active"
-    assert service.api.status()["mode"] == "disarmed"
+    assert service.status()["mode"] == "disarmed"
     assert "disarmed" in service.unit.show("StatusText")
-    axes = service.api.status()["axes"]
+    axes = service.status()["axes"]
     assert axes["rotation"]["torque_on"] is False
 
 

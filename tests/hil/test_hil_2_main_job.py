@@ -41,7 +41,7 @@ def test_the_lifts_move_together_by_the_cli(ready: Grader, rig: Rig, listener: R
     listener.drain()
     out = ready.cli("jog", "height", "30mm").stdout
     assert "arrived" in out
-    state = ready.api.status()
+    state = ready.status()
     left, right = (state["axes"][name]["measured"] for name in ("lift_left", "lift_right"))
     assert left == pytest.approx(130.0, abs=2.5)
     assert abs(left - right) <= 3.0

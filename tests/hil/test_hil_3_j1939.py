@@ -138,7 +138,7 @@ def test_a_claiming_daemon_of_can_utils_lives_beside_it(ready: Grader, listener:
     finally:
         daemon.terminate()
         daemon.communicate(timeout=5)
-    assert not faults(ready.api.status()) - {"can.address_conflict"}
+    assert not faults(ready.status()) - {"can.address_conflict"}
 
 
 def test_a_stop_message_stops_and_a_commanded_address_is_taken(ready: Grader, listener: RawBus) -> None:

@@ -70,7 +70,7 @@ def test_a_frozen_daemon_is_replaced_and_the_blade_stands(ready: Grader, rig: Ri
     enabled = [f for f in listener.drain() if f.pgn == ACM and f.data[3] & 0x10]
     assert not enabled, "no motion was enabled after the freeze"
     # The freeze was our doing and told: this reason is kept for the operator.
-    assert ready.api.status()["mode"] == "disarmed"
+    assert ready.status()["mode"] == "disarmed"
 
 
 @pytest.mark.restarts(1)
@@ -113,12 +113,12 @@ def test_stop_and_start_by_hand(ready: Grader, rig: Rig, listener: RawBus) -> No
 def test_the_clock_may_jump(ready: Grader, rig: Rig) -> None:
     """An hour forward and back, by a GPS receiver or a person: control does not notice."""
     turn(ready, rig)
-    pid, overruns = ready.unit.pid, ready.api.status()["tick"]["overruns_n"]
+    pid, overruns = ready.unit.pid, ready.status()["tick"]["overruns_n"]
     real_s, mono_s = time.time(), time.monotonic()
     try:
         for step_s in (3600.0, -3600.0, 86_400.0 * 400):
             time.clock_settime(time.CLOCK_REALTIME, real_s + step_s + time.monotonic() - mono_s)
-            state = ready.api.status()
+            state = ready.status()
             assert state["mode"] == "auto"
     finally:
         time.clock_settime(time.CLOCK_REALTIME, real_s + time.monotonic() - mono_s)

@@ -71,7 +71,7 @@ class Soak:
 
     def stop_and_reset(self) -> None:
         """An operator stops it."""
-        self.grader.api.stop()
+        self.grader.client.stop()
         self.grader.wait("stopped", lambda s: s["mode"] == "stopped", 3.0)
 
     def settled(self) -> Status:
@@ -93,7 +93,7 @@ class Soak:
         """What an operator does: wait until it is ready, arm, automatic."""
         state = self.settled()
         if state["mode"] == "stopped":
-            self.grader.api.command("reset")
+            self.grader.client.reset()
             state = self.grader.wait("reset", lambda s: s["mode"] == "disarmed", 5.0)
         if state["mode"] != "auto" or faults(state):
             self.grader.disarm()

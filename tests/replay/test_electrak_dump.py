@@ -14,7 +14,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graderd.drivers.electrak.dump import FrameDecoder, candump_line, dump, main, parse_candump_line, read_file, text_of
+from graderd.drivers.electrak.dump import DecodedFrame, FrameDecoder, dump, main, text_of
+from graderd.drivers.j1939.bus_health import BusEvent
+from graderd.drivers.j1939.can_logs import candump_line, parse_candump_line, read_file
 from graderd.drivers.j1939.dm1 import dtc_of, encode
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id
 from graderd.drivers.j1939.transport import Transport
@@ -42,6 +44,14 @@ AFM = {
 }
 
 
+def message(frame: Frame, t_s: float, **more: Any) -> can.Message:
+    return can.Message(t_s, frame.can_id, frame.extended, data=frame.data, **more)
+
+
+def decoded(frame: Frame, t_s: float = 0.0, decoder: FrameDecoder | None = None) -> DecodedFrame:
+    return (decoder or FrameDecoder()).decode(message(frame, t_s))
+
+
 def candump_compact(start_s: float) -> str:
     return "".join(
         f"({start_s + t:.6f}) can0 {f.can_id:0{8 if f.extended else 3}X}#{f.data.hex().upper()}\n" for t, f in FRAMES
@@ -61,7 +71,7 @@ def dumped(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in out.getvalue().splitlines()]
 
 
-@pytest.fixture(params=["log", "txt", "asc", "blf", "mf4"])
+@pytest.fixture(params=["log", "txt", "asc", "blf", "mf4", "trc", "csv"])
 def log(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     path = tmp_path / f"trip.{request.param}"
     if request.param == "log":
@@ -77,7 +87,8 @@ def log(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
                         arbitration_id=frame.can_id,
                         data=frame.data,
                         is_extended_id=frame.extended,
-                        channel=0,
+                        channel=1,
+                        is_rx=True,
                     )
                 )
     return path
@@ -111,7 +122,8 @@ def test_every_log_format_gives_the_same_frames(log: Path) -> None:
 def test_every_form_of_candump_line_is_read(line: str) -> None:
     timed = parse_candump_line(line)
     assert timed is not None
-    assert timed[1] == FRAMES[1][1]
+    assert (timed.arbitration_id, bytes(timed.data)) == FRAMES[1][1][:2]
+    assert timed.timestamp == (1622749162.1 if "(1" in line else timed.timestamp)
 
 
 @given(st.text(max_size=60))
@@ -120,7 +132,7 @@ def test_other_lines_are_passed_over(line: str) -> None:
 
 
 def test_network_management_and_diagnostics_have_names() -> None:
-    decode = FrameDecoder().decode
+    decode = decoded
     ask = decode(Frame(make_id(6, Pgn.REQUEST, 40, 231), bytes.fromhex("EBFE00")), 0.0)
     assert ask["signals"] == {"requested_pgn": 65259, "requested": "component_id"}
     nack = decode(Frame(make_id(6, Pgn.ACKNOWLEDGEMENT, 231), bytes.fromhex("01FFFFFF2804F000")), 0.0)
@@ -143,23 +155,31 @@ def test_a_long_message_is_put_together_in_its_last_frame() -> None:
     for step in range(60):
         frames += sender.poll(step * 0.01)
     decoder = FrameDecoder()
-    decoded = [decoder.decode(frame, index * 0.05) for index, frame in enumerate(frames)]
-    assert decoded[0]["signals"] == {"control": "bam", "about_pgn": 65259, "about": "component_id"}
-    assert decoded[-1]["signals"]["text"] == "graderd*blade controller*7**"
+    told = [decoded(frame, index * 0.05, decoder) for index, frame in enumerate(frames)]
+    assert told[0]["signals"] == {"control": "bam", "about_pgn": 65259, "about": "component_id"}
+    assert told[-1]["signals"]["text"] == "graderd*blade controller*7**"
 
 
 @given(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8), st.booleans())
 def test_no_frame_can_make_it_fail_and_every_object_is_json(can_id: int, data: bytes, extended: bool) -> None:
-    decoded = FrameDecoder().decode(Frame(can_id if extended else can_id & 0x7FF, data, extended), 1.0)
-    assert set(json.loads(json.dumps(decoded))) >= {"t_s", "can_id", "pgn", "source", "destination", "name", "signals"}
-    text_of(decoded)
+    told = decoded(Frame(can_id if extended else can_id & 0x7FF, data, extended), 1.0)
+    keys = {"t_s", "kind", "can_id", "pgn", "source", "destination", "name", "signals"}
+    assert set(json.loads(json.dumps(told))) >= keys
+    text_of(told)
 
 
 @pytest.mark.parametrize(
     ("name", "content", "why"),
     [
         ("absent.log", None, "no such file"),
-        ("letter.log", "Dear reader\n", "no CAN frame in candump's form"),
+        ("letter.log", "Dear reader\n", "holds no CAN frame"),
+        ("empty.log", "", "is empty"),
+        ("empty.trc", "", "is empty"),
+        ("empty.asc", "", "is empty"),
+        ("empty.csv", "", "is empty"),
+        ("empty.blf", "", "is empty"),
+        ("headed.asc", "date Wed Jun 03 19:39:22 2021\nbase hex  timestamps absolute\n", "holds no CAN frame"),
+        ("damaged.log.gz", "not packed at all", "cannot be read"),
         ("damaged.blf", "not a BLF file at all", "cannot be read"),
     ],
 )
@@ -189,6 +209,103 @@ def test_a_truncated_log_gives_what_it_holds(tmp_path: Path) -> None:
     empty.write_text("")
     with pytest.raises(ProtocolError):
         list(read_file(empty))
+
+
+SPECIAL = [
+    ("(1.000000) can0 20000040#0000000000000000", "error", 0x40, ""),
+    ("(1.000000) can0 20000004#0030000000000000", "error", 0x04, "0030000000000000"),
+    ("(1.000000) can0 200000A8#0000080000000000", "error", 0xA8, ""),
+    ("(1.000000) can0 18EA13E7#R", "remote", 0x18EA13E7, ""),
+    ("(1.000000) can0 123#R8", "remote", 0x123, ""),
+    ("(1.000000) can0 18EF13E7##1DC0519150000000000000000", "fd", 0x18EF13E7, "DC0519150000000000000000"),
+    (" (1.0)  can0  18EF13E7  [12]  DC 05 19 15 00 00 00 00 00 00 00 00", "fd", 0x18EF13E7, "DC0519150000000000000000"),
+    (" (1.0)  can0  20000004   [8]  00 30 00 00 00 00 00 00   ERRORFRAME", "error", 0x04, "0030000000000000"),
+    ("  can0  18EA13E7   [8]  remote request", "remote", 0x18EA13E7, ""),
+]
+
+
+@pytest.mark.parametrize(("line", "kind", "can_id", "data"), SPECIAL)
+def test_error_remote_and_fd_frames_are_told_as_what_they_are(line: str, kind: str, can_id: int, data: str) -> None:
+    frame = parse_candump_line(line)
+    assert frame is not None
+    told = FrameDecoder().decode(frame)
+    assert (told["kind"], told["can_id"]) == (kind, can_id)
+    assert told["data"] == data or not data
+    assert told["name"] not in ("ACM", "AFM")
+    assert {"error": "error", "remote": "remote", "fd": "CAN FD"}[kind] in text_of(told)
+
+
+def test_error_frames_say_what_is_wrong() -> None:
+    told = {
+        event: FrameDecoder().decode(frame)["signals"]
+        for event in BusEvent
+        if (frame := parse_candump_line(candump_line(event, 1.0))) is not None
+    }
+    assert told[BusEvent.BUS_OFF] == {"errors": ["bus_off"], "state": "bus_off"}
+    assert told[BusEvent.ERROR_PASSIVE] == {"errors": ["controller"], "state": "error_passive"}
+    assert told[BusEvent.REFUSED] == {"errors": ["transmit_timeout"]}
+    assert len(told) == len(BusEvent)
+
+
+@pytest.mark.parametrize("suffix", ["log", "asc", "blf", "csv", "log.gz", "asc.gz"])
+def test_every_format_keeps_error_and_remote_frames_apart(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"trip.{suffix}"
+    with can.Logger(path) as writer:
+        writer.on_message_received(message(FRAMES[0][1], 1.0, channel=1, is_rx=True))
+        writer.on_message_received(can.Message(1.1, 0x18EA13E7, is_remote_frame=True, channel=1, is_rx=True))
+        writer.on_message_received(can.Message(1.2, 0x04, False, is_error_frame=True, channel=1, is_rx=True))
+    assert [told["kind"] for told in dumped(path)] == ["data", "remote", "error"]
+
+
+def test_broken_bytes_and_half_lines_cost_their_line_only(tmp_path: Path) -> None:
+    path = tmp_path / "broken.log"
+    good = candump_compact(0.0).encode()
+    path.write_bytes(good + b"(1.0) can0 18E\xff\xfe#00\n" + b"\x00\x80\n(2.0) can0 18EF1300#DC0\n" + good)
+    assert len(dumped(path)) == 2 * len(FRAMES)
+
+
+# -- long messages that do not end as they should
+
+
+def bam(source: int, destination: int = 255, control: int = 32) -> Frame:
+    body = bytes((control, 20, 0, 3, 255, 0xEB, 0xFE, 0))
+    return Frame(make_id(7, Pgn.TP_CONNECTION, source, destination), body)
+
+
+def packet(n: int, source: int, destination: int = 255) -> Frame:
+    return Frame(make_id(7, Pgn.TP_DATA, source, destination), bytes((n,)) + b"abcdefg")
+
+
+def complete(decoder: FrameDecoder, frames: list[tuple[float, Frame]]) -> bool:
+    return any("message" in decoded(frame, t_s, decoder)["signals"] for t_s, frame in frames)
+
+
+def test_packets_a_minute_apart_are_no_message() -> None:
+    frames = [(0.0, bam(40)), (0.1, packet(1, 40)), (60.0, packet(2, 40)), (60.1, packet(3, 40))]
+    assert not complete(FrameDecoder(), frames)
+    assert complete(FrameDecoder(), [(0.1 * n, frame) for n, (_, frame) in enumerate(frames)])
+
+
+@pytest.mark.parametrize("by", [(40, 231), (231, 40)])
+def test_an_aborted_connection_does_not_go_on(by: tuple[int, int]) -> None:
+    abort = Frame(make_id(7, Pgn.TP_CONNECTION, *by), bytes((255, 3, 255, 255, 255, 0xEB, 0xFE, 0)))
+    frames = [bam(40, 231, 16), packet(1, 40, 231), packet(2, 40, 231), packet(3, 40, 231)]
+    assert complete(FrameDecoder(), [(0.1 * n, frame) for n, frame in enumerate(frames)])
+    assert not complete(FrameDecoder(), [(0.1 * n, frame) for n, frame in enumerate([*frames[:2], abort, *frames[2:]])])
+
+
+def test_packets_that_the_receiver_asks_for_again_are_put_in_their_place() -> None:
+    again = Frame(make_id(7, Pgn.TP_CONNECTION, 231, 40), bytes((17, 2, 2, 255, 255, 0xEB, 0xFE, 0)))
+    frames = [bam(40, 231, 16), packet(1, 40, 231), packet(2, 40, 231), again, packet(2, 40, 231), packet(3, 40, 231)]
+    assert complete(FrameDecoder(), [(0.1 * n, frame) for n, frame in enumerate(frames)])
+
+
+def test_sessions_left_open_block_nothing() -> None:
+    decoder = FrameDecoder()
+    for source in range(200):
+        decoded(bam(source), 0.001 * source, decoder)
+    assert complete(decoder, [(0.3, bam(220)), (0.4, packet(1, 220)), (0.5, packet(2, 220)), (0.6, packet(3, 220))])
+    assert len(decoder._listener._sessions) <= 16
 
 
 def test_the_command_line_writes_json_and_survives_a_closed_pipe(tmp_path: Path) -> None:

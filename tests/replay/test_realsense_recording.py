@@ -17,8 +17,8 @@ from graderd.hal.errors import DeviceMissingError, DeviceTimeoutError, Lifecycle
 from graderd.hal.settings import CameraSettings
 from graderd.perception import CameraCalibration, PerceptionSettings
 from graderd.perception.classifier import make_classifier
-from tests.perception_scenes import Scene, render
-from tests.realsense_devices import Color, Depth, SoftD455, record
+from harness.perception_scenes import Scene, render
+from harness.realsense_devices import Color, Depth, SoftD455, record
 
 COUNT = 6
 COLOR_SIZE, DEPTH_SIZE = (320, 200), (212, 120)

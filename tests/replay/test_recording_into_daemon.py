@@ -10,8 +10,8 @@ import pytest
 from graderd.drivers.simulated.camera import RigCamera
 from graderd.hal.settings import CameraSettings
 from graderd.simulator.control_client import RigControl
+from harness.realsense_devices import SoftD455, record
 from tests.machine import machine, start_rig
-from tests.realsense_devices import SoftD455, record
 
 pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(240)]
 FRAMES_N = 30
@@ -61,9 +61,9 @@ async def test_a_recording_drives_the_daemon(tmp_path: Path) -> None:
         assert seen.soil.share_left > 0.5
         assert seen.mode == "disarmed"
         await whole.until(lambda s: all(r.met for r in s.readiness if r.mandatory))
-        assert (await whole.command("arm")).status_code == 200
+        await whole.command("arm")
         await whole.until(lambda s: s.mode == "manual")
-        assert (await whole.command("auto")).status_code == 200
+        await whole.command("auto")
         decided = await whole.until(lambda s: s.decision.zone is not None)
         assert decided.decision.zone == "left"
         await whole.until(lambda s: (s.axes["rotation"].measured or 0.0) > 3.0)

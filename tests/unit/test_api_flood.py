@@ -12,7 +12,7 @@ import pytest
 from graderd.api.limiter import Pace
 from graderd.api.settings import ApiLimits
 from graderd.core.machine import Mode
-from tests.unit.api_daemon import TICK_S, serving, within
+from harness.api_daemon import TICK_S, serving, within
 from tests.unit.test_cli_modes import command_line
 
 FLOOD_S = 2.5
@@ -35,7 +35,7 @@ async def test_the_tick_goes_on_and_stop_gets_through(
         # How late ticks come before the flood: this machine may be busy with other things.
         quiet_s = sorted(daemon.late_s)[36]
         flood = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "tests.unit.api_flood", str(path), str(FLOOD_S), kind, str(connections_n)),
+            *(sys.executable, "-m", "harness.api_flood", str(path), str(FLOOD_S), kind, str(connections_n)),
             stdout=asyncio.subprocess.PIPE,
         )
         await asyncio.sleep(1.0)  # the flood's own start
@@ -66,7 +66,7 @@ async def test_the_tick_goes_on_and_stop_gets_through(
 async def test_a_flood_of_stops_is_served_at_its_own_pace(tmp_path: Path) -> None:
     async with serving(tmp_path) as (daemon, path):
         flood = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "tests.unit.api_flood", str(path), "2", "stop", "50"),
+            *(sys.executable, "-m", "harness.api_flood", str(path), "2", "stop", "50"),
             stdout=asyncio.subprocess.PIPE,
         )
         assert flood.stdout is not None

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from graderd.api.app import make_app
 from graderd.api.settings import ApiLimits
 from graderd.core.machine import Mode, Unmet
-from tests.unit.api_daemon import FakeDaemon, serving
+from harness.api_daemon import FakeDaemon, serving
 
 NO_LIMITS = ApiLimits(rate_hz=1e6, burst_n=10**6, stop_rate_hz=1e6, accept_rate_hz=1e6, command_timeout_s=30.0)
 MANY = settings(

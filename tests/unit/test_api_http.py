@@ -22,7 +22,7 @@ from graderd.api.server import SocketError, SocketInUseError, serve
 from graderd.api.settings import ApiLimits
 from graderd.core.machine import Mode, Unmet
 from graderd.core.status import Status
-from tests.unit.api_daemon import JPEG, FakeDaemon, serving, within
+from harness.api_daemon import JPEG, FakeDaemon, serving, within
 
 
 @contextlib.asynccontextmanager

@@ -15,7 +15,7 @@ from graderd.api.settings import ApiLimits
 from graderd.core import commands as cmd
 from graderd.core.machine import Mode
 from graderd.core.status import Status
-from tests.unit.api_daemon import FakeDaemon, serving, within
+from harness.api_daemon import FakeDaemon, serving, within
 
 
 def connect(path: Path, target: str) -> Any:

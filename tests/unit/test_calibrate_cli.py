@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import errno
 import json
+import os
 import re
 import tomllib
 from pathlib import Path
@@ -23,7 +26,7 @@ from graderd.perception import CameraCalibration
 from graderd.perception.calibration import with_pose
 from graderd.perception.frame_set import Entry, FrameSetWriter
 from graderd.perception.settings import StreamCalibration
-from tests.perception_scenes import Scene, render
+from harness.perception_scenes import Scene, render
 
 Captured = pytest.CaptureFixture[str]
 COLOR, DEPTH = (480, 300), (424, 240)
@@ -160,18 +163,28 @@ def test_the_daemon_turns_the_blade_only_with_consent(
 ) -> None:
     asked: list[dict[str, Any]] = []
 
+    names = ["000.color.png"]
+
     class Daemon:
         def service(self, name: str, timeout_s: float, **arguments: Any) -> dict[str, Any]:
+            if name == "camera.calibration_file":
+                return {"base64": base64.b64encode((frames / arguments["file"]).read_bytes()).decode()}
             asked.append({"name": name, **arguments})
-            return {"frame_set": str(frames)}
+            return {"frame_set": "calibration-1", "files": names}
 
-    monkeypatch.setattr(command, "daemon_of", lambda _context: Daemon())
+    monkeypatch.setattr(command, "client_of", lambda _context: Daemon())
     monkeypatch.setattr(typer, "confirm", lambda _question, **_options: False)
     live = ["calibrate", "camera", "--config", str(config), "--save", str(config.parent / "x.jpg")]
     assert run_app(live) == 1
     assert asked == []
+    names[:] = ["../../etc/passwd"]
+    assert run_app([*live, "--yes"]) == 1
+    assert "the daemon names a file" in capsys.readouterr().err
+    asked.clear()
+    names[:] = [path.name for path in frames.iterdir()]
     assert run_app([*live, "--angles-deg", "-30,0,30", "--yes"]) == 0
     capsys.readouterr()
+    assert load(config).camera.calibration.calibrated_at.endswith("from calibration-1")
     assert asked == [{"name": "camera.calibrate", "consent": True, "angles_deg": [-30.0, 0.0, 30.0]}]
     assert load(config).camera.calibration.color.position_x_m == pytest.approx(0.83, abs=0.004)
 
@@ -195,3 +208,22 @@ def test_a_new_configuration(tmp_path: Path) -> None:
     assert write_calibration(path, {"blade": {"length_m": np.float64(1.25).item()}}) is None
     assert tomllib.loads(path.read_text()) == {"blade": {"length_m": 1.25}}
     assert [p.name for p in tmp_path.iterdir()] == ["new.toml"]
+
+
+@pytest.mark.parametrize("kept", ["configuration", "picture"])
+def test_nothing_moves_where_the_result_could_not_be_kept(
+    config: Path, kept: str, monkeypatch: pytest.MonkeyPatch, capsys: Captured
+) -> None:
+    """Neither is the daemon asked for anything, nor the person."""
+    monkeypatch.setattr(command, "client_of", lambda _context: pytest.fail("the daemon was asked"))
+    picture = config.parent / ("nowhere" if kept == "picture" else "") / "shown.png"
+    if kept == "configuration":
+        monkeypatch.setattr(os, "fsync", refuse)
+    live = ["calibrate", "camera", "--config", str(config), "--save", str(picture), "--yes"]
+    assert run_app(live) == 1
+    assert "cannot be written" in capsys.readouterr().err
+    assert config.read_text() == CONFIG
+
+
+def refuse(*_: object) -> None:
+    raise PermissionError(errno.EACCES, "Permission denied")

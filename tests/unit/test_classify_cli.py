@@ -15,8 +15,8 @@ from graderd.core.soil import Zone
 from graderd.perception import METHODS, CameraCalibration
 from graderd.perception.frame_set import Entry, FrameSetWriter
 from graderd.perception.settings import StreamCalibration
-from tests.perception_scenes import Scene, height_field, render, volumes_l
-from tests.realsense_devices import SoftD455, record
+from harness.perception_scenes import Scene, height_field, render, volumes_l
+from harness.realsense_devices import SoftD455, record
 
 FIELDS = [
     "id",

@@ -19,7 +19,7 @@ from graderd.cli.move import VALUE, Arrival, JogValue, parse_value
 from graderd.core.axes import JOG_AXES, JogName
 from graderd.core.machine import Mode
 from graderd.core.status import FaultStatus
-from tests.unit.api_daemon import FakeDaemon, serving, within
+from harness.api_daemon import FakeDaemon, serving, within
 from tests.unit.test_cli_modes import Capture, cli, command_line
 
 
@@ -146,7 +146,7 @@ def lifts(time_s: float, limited: float | None, *faults: str) -> dict[str, Any]:
 
 
 def test_lifts_that_the_daemon_holds_for_a_fault_will_not_arrive() -> None:
-    arrival = Arrival(("lift_left", "lift_right"), 0.0)
+    arrival = Arrival(("lift_left", "lift_right"))
     apart = "lift_left.sides_apart"
     # Side by side they are waited for: a fault of another axis, a short hold, a side that waits for the other.
     for second, status in enumerate(

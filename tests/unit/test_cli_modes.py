@@ -16,10 +16,11 @@ from typing import Any
 
 import pytest
 
+from graderd import places
 from graderd.cli.app import run_app
 from graderd.cli.status import sections
 from graderd.core.machine import Mode, Unmet
-from tests.unit.api_daemon import FakeDaemon, serving, within
+from harness.api_daemon import FakeDaemon, serving, within
 
 Capture = pytest.CaptureFixture[str]
 
@@ -168,7 +169,8 @@ def test_the_socket_is_found_by_the_environment(
     assert run_app(["status"]) == 3
     assert "named.sock" in capsys.readouterr().err
     monkeypatch.delenv("GRADERD_SOCKET")
-    monkeypatch.setattr("graderd.cli.client.SYSTEM_SOCKET", tmp_path / "system.sock")
+    monkeypatch.setattr(places, "SOCKET", tmp_path / "system.sock")
+    monkeypatch.setattr(places, "CONFIG", tmp_path / "graderd.toml")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "user"))
     assert run_app(["status"]) == 3
     assert str(tmp_path / "user" / "graderd" / "graderd.sock") in capsys.readouterr().err

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from graderd.cli.app import make_cli, run_app
 from graderd.core.faults.catalogue import CATALOGUE
-from tests.unit.api_daemon import serving
+from harness.api_daemon import serving
 from tests.unit.test_cli_modes import Capture, cli
 
 
@@ -67,6 +67,33 @@ def test_explain_lists_all_and_suggests_the_nearest(capsys: Capture) -> None:
     assert all(key in out for key in CATALOGUE)
     assert run_app(["explain", "lift_left.overlod"]) == 1
     assert "Did you mean lift_left.overload?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('[tilt]\nprofile = "electrak_xx"\n', "electrak_xx"),
+        ('[rotation]\nprofile = "ph45"\n', "no firmware profile 'ph45'"),
+        (f'[api]\nsocket = "/run/{"x" * 120}"\n', "api.socket"),
+        ('[api]\nsocket = ""\n', "api.socket"),
+        ('[api]\nsocket_group = "no such group"\n', "api.socket_group"),
+        ("[camera]\nrate_hz = -1\n", "camera.rate_hz"),
+    ],
+)
+def test_check_refuses_what_run_refuses_and_run_before_anything_starts(
+    tmp_path: Path, text: str, says: str, capsys: Capture
+) -> None:
+    path = tmp_path / "graderd.toml"
+    path.write_text(text)
+    assert run_app(["config", "check", str(path)]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert says in said
+    run = [sys.executable, "-m", "graderd", "run", "--sim", "--config", str(path)]
+    done = subprocess.run(run, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert says in done.stderr
 
 
 def test_config_check_tells_each_mistake_in_a_line(tmp_path: Path, capsys: Capture) -> None:
@@ -183,7 +210,9 @@ def test_daemon_and_guard_load_no_opencv(module: str) -> None:
 def test_stop_does_not_wait_for_large_imports() -> None:
     code = (
         "import sys, graderd.cli.app as app; app.run_app(['--socket', 'none', 'stop']);"
-        "sys.exit(any(name in sys.modules for name in ('cv2', 'numpy.linalg', 'fastapi', 'httpx', 'rich.console')))"
+        # typer loads pydantic itself; the models built on it take as long again
+        "heavy = ('cv2', 'numpy', 'fastapi', 'httpx', 'websockets', 'rich.console', 'graderd.core.status');"
+        "sys.exit(any(name in sys.modules for name in heavy))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False)
     assert run.returncode == 0, run.stderr

@@ -60,10 +60,35 @@ def test_unreadable_files(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         load(tmp_path / "absent.toml")
     path = tmp_path / "g.toml"
-    path.write_bytes(b"\xff\xfe")
-    with pytest.raises(ConfigError, match="not UTF-8"):
+    path.write_bytes(b"# one\nport = '\xff'\n")
+    with pytest.raises(ConfigError, match=r"g\.toml:2: not UTF-8 text at byte 14"):
         load(path)
     assert "not valid TOML" in problems("[rotation\n", path)[0]
+
+
+@pytest.mark.parametrize(
+    ("raw", "said"),
+    [
+        ("[can]\n".encode("utf-8-sig"), "g.toml:1: begins with a byte order mark, not TOML. Save it as UTF-8 without"),
+        ("[can]\n".encode("utf-16"), "g.toml:1: begins with UTF-16 text"),
+        (b"[can]\nbitrate_n = 250000\r[tilt]\n", "g.toml:2: a carriage return without a line feed"),
+        (b"[can]\n\x00\n", "not valid TOML"),
+    ],
+)
+def test_what_editors_do_to_a_file(tmp_path: Path, raw: bytes, said: str) -> None:
+    path = tmp_path / "g.toml"
+    path.write_bytes(raw)
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    (problem,) = caught.value.problems
+    assert said in problem
+
+
+def test_line_ends_of_windows_are_line_ends(tmp_path: Path) -> None:
+    path = tmp_path / "g.toml"
+    path.write_bytes(b"# site 7\r\n[tilt]\r\nmax_mm = 90.0\r\n")
+    assert load(path).tilt.max_mm == 90.0
+    assert "g.toml:3: tilt.max_m" in problems("[tilt]\n# \u2028 \x85\nmax_m = 90.0\n", path)[0]
 
 
 values = st.recursive(

@@ -14,8 +14,8 @@ from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Zone
 from graderd.perception import CameraCalibration, PerceptionSettings, classifier
 from graderd.runtime.app.backends import check_plugins, rotator_of
+from harness.perception_scenes import Scene, render
 from tests.contract import test_valve_rotator as valve
-from tests.perception_scenes import Scene, render
 
 ROOT = Path(__file__).parents[2]
 

@@ -39,7 +39,8 @@ CONDITIONS = {
         "thermal_limit sides_apart"
     ),
     "can": (
-        "interface_down bus_off error_passive unplugged queue_overrun address_conflict cannot_claim claim_storm flood"
+        "interface_down bus_off error_passive unplugged adapter_refuses queue_overrun address_conflict cannot_claim "
+        "claim_storm flood"
     ),
     "camera": (
         "missing stale black blown_out blocked frozen blurred torn wrong_resolution knocked depth_missing "

@@ -107,6 +107,35 @@ def test_requests_for_claims_are_answered() -> None:
     assert claims(claimed().on_request(1.0)) == [231]
 
 
+def test_a_claim_that_is_owed_is_put_off_and_never_dropped() -> None:
+    """Else the one who asked, or who claimed our address with a higher NAME, believes that it is free."""
+    for ask in (lambda c, t: c.on_request(t), lambda c, t: c.on_claim(231, HIGHER, t)):
+        claimer = claimed()
+        for _ in range(8):
+            claimer.on_request(1.0)
+        assert claims(ask(claimer, 1.01)) == [], "the bucket is empty"
+        later = [frame for step in range(15) for frame in claimer.poll(1.02 + 0.02 * step)]
+        assert claims(later) == [231], "owed once, however often it was asked for"
+        assert [frame for step in range(100) for frame in claimer.poll(2.0 + 0.02 * step)] == []
+
+
+def test_a_cannot_claim_that_is_owed_is_put_off_and_never_dropped() -> None:
+    claimer = claimed(Name(identity=5, industry_group=3, function=132))
+    for _ in range(8):
+        claimer.on_request(1.0)
+    claimer.on_claim(231, 1, 1.0)
+    assert claims([frame for step in range(60) for frame in claimer.poll(1.0 + 0.02 * step)]) == [NULL]
+
+
+def test_a_putting_off_is_forgotten_with_the_address_it_was_about() -> None:
+    claimer = claimed()
+    for _ in range(8):
+        claimer.on_request(1.0)
+    claimer.on_claim(231, LOWER, 1.0)
+    sent = [frame for step in range(100) for frame in claimer.poll(1.0 + 0.02 * step)]
+    assert claims(sent) == [128]
+
+
 def test_an_address_violation_is_answered_with_a_claim_at_most_every_five_seconds() -> None:
     claimer = claimed()
     sent = [len(claimer.on_violation(1.0 + 0.1 * i)) for i in range(100)]

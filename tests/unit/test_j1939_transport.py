@@ -7,7 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graderd.drivers.j1939.ids import GLOBAL, Frame, Pgn, destination_of, make_id, pgn_of, source_of
-from graderd.drivers.j1939.transport import BAM_GAP_S, MAX_SESSIONS_N, Abort, Control, Message, Transport
+from graderd.drivers.j1939.transport import (
+    BAM_GAP_S,
+    DATA_BURST_N,
+    DATA_RATE_HZ,
+    MAX_SESSIONS_N,
+    Abort,
+    Control,
+    Message,
+    Transport,
+)
 
 
 def node(address: int) -> Transport:
@@ -109,6 +118,40 @@ def test_a_cts_of_zero_means_wait_and_one_beyond_the_end_is_refused() -> None:
     assert sender.on_connection(20, 10, bytes((Control.CTS, 0, 1, 255, 255)) + about, 0.1) == []
     (abort,) = sender.on_connection(20, 10, bytes((Control.CTS, 1, 9, 255, 255)) + about, 0.2)
     assert abort.data[0] == Control.ABORT
+
+
+def test_clear_to_send_without_end_draws_packets_with_an_end() -> None:
+    """1,000 CTS drew 4,000 frames. The standard lets a packet be asked for three times in all."""
+    sender = node(10)
+    sender.send(Pgn.COMPONENT_ID, bytes(28), 20, 0.0)
+    about = Pgn.COMPONENT_ID.to_bytes(3, "little")
+    frames: list[Frame] = []
+    for step in range(1000):
+        frames += sender.on_connection(20, 10, bytes((Control.CTS, 4, 1, 255, 255)) + about, 0.001 * step)
+        frames += sender.poll(0.001 * step)
+    packets = [frame for frame in frames if pgn_of(frame.can_id) == Pgn.TP_DATA]
+    assert len(packets) <= 3 * 4
+    assert frames[-1].data[:2] == bytes((Control.ABORT, Abort.RETRANSMITS))
+    assert len(frames) == len(packets) + 1
+
+
+def test_packets_leave_no_faster_than_their_rate() -> None:
+    sender = node(10)
+    about = Pgn.COMPONENT_ID.to_bytes(3, "little")
+    sent_n = 0
+    for destination in range(20, 20 + MAX_SESSIONS_N):
+        sender.send(Pgn.COMPONENT_ID, bytes(1785), destination, 0.0)
+        sent_n += len(sender.on_connection(destination, 10, bytes((Control.CTS, 255, 1, 255, 255)) + about, 0.0))
+    for step in range(1, 101):
+        sent_n += len(sender.poll(0.01 * step))
+    assert sent_n <= DATA_BURST_N + DATA_RATE_HZ * 1.0
+
+
+def test_requests_to_send_without_end_are_not_all_answered() -> None:
+    receiver = node(20)
+    rts = bytes((Control.RTS, 20, 0, 3, 255, 0xEB, 0xFE, 0))
+    answers_n = sum(len(receiver.on_connection(10, 20, rts, 0.001 * step)) for step in range(2000))
+    assert answers_n <= 20 + 2 * 50
 
 
 @pytest.mark.parametrize("size", [0, 8, 1786, 65535])

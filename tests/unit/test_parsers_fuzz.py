@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fuzz_parsers import MOST_BYTES, fuzz, targets
+from harness.fuzz_parsers import MOST_BYTES, fuzz, targets
 
 NAMES = (
     "config", "migration", "manifest", "camera file", "profile name", "child", "state file", "client command",

@@ -29,7 +29,7 @@ from graderd.simulator.camera.optics import knocked
 from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.soil import SoilField
-from tests.perception_scenes import Scene, render
+from harness.perception_scenes import Scene, render
 
 NOMINAL = CameraCalibration()
 POSE_HERE = {

@@ -19,7 +19,7 @@ from graderd.perception.color import (
 )
 from graderd.perception.geometry import LEFT, RIGHT, View, blade_region, image_thirds
 from graderd.perception.settings import ColorSettings
-from tests.perception_scenes import Scene, render
+from harness.perception_scenes import Scene, render
 
 SETTINGS = PerceptionSettings()
 CALIBRATION = CameraCalibration()

@@ -10,7 +10,7 @@ from graderd.hal.camera import DepthImage
 from graderd.perception import CameraCalibration, PerceptionSettings
 from graderd.perception.depth import DepthJudge, HeightMap, fill_hidden
 from graderd.perception.geometry import LEFT, RIGHT, View
-from tests.perception_scenes import PoseError, Scene, height_field, render, volumes_l
+from harness.perception_scenes import PoseError, Scene, height_field, render, volumes_l
 
 SETTINGS = PerceptionSettings()
 CALIBRATION = CameraCalibration()

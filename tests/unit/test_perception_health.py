@@ -22,7 +22,7 @@ from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.piles import SceneZone
 from graderd.simulator.grader.world import World, scene_heights
-from tests.perception_scenes import PoseError, Scene, render
+from harness.perception_scenes import PoseError, Scene, render
 
 ANGLE_DEG = 10.0
 

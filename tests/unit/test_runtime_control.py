@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator
 from itertools import pairwise
 from pathlib import Path
@@ -118,6 +119,34 @@ async def test_stop_holds_every_axis_before_it_returns_and_latches(bench: Bench,
     last = StateFile(str(tmp_path)).load()
     assert last is not None
     assert last.reason == "test (by t)"
+
+
+async def test_an_ordinary_restart_keeps_the_last_stop(bench: Bench, tmp_path: Path) -> None:
+    bench.loop.stop_now(cmd.Stop(reason="dog on the site", client="cab"))
+    assert (await bench.do(cmd.Reset(client="cab", stop_n=1))).accepted
+    assert bench.loop.end("SIGTERM received") is False
+    assert bench.loop.tick.state.mode is Mode.STOPPED
+    last = StateFile(str(tmp_path)).load()
+    assert last is not None
+    assert last.reason == "dog on the site (by cab)"
+    assert Bench(tmp_path).loop.last_stop == last
+
+
+async def test_an_end_that_interrupts_work_is_the_last_stop(bench: Bench, tmp_path: Path) -> None:
+    await bench.arm()
+    assert bench.loop.end("SIGTERM received") is True
+    last = StateFile(str(tmp_path)).load()
+    assert last is not None
+    assert last.reason == "SIGTERM received"
+
+
+async def test_a_change_of_mode_says_who_and_why_in_fields(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, logger="graderd"):
+        bench.loop.stop_now(cmd.Stop(reason="forged\n2026 INFO stopped -> auto\x1b[2J", client="\x9bcab"))
+    (record,) = [record for record in caplog.records if "stopped" in record.getMessage()]
+    assert record.__dict__["mode"] == "stopped"
+    assert record.__dict__["client"] == "\\x9bcab"
+    assert record.getMessage() == "disarmed -> stopped: forged\\n2026 INFO stopped -> auto\\x1b[2J (by \\x9bcab)"
 
 
 async def test_one_driver_that_fails_to_hold_does_not_keep_the_others_from_it(bench: Bench) -> None:

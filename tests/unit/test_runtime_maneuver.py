@@ -17,7 +17,7 @@ from graderd.hal.lifecycle import Lifecycle
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.maneuver import Maneuver
 from graderd.runtime.state_file import StateFile
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 from tests.fakes import FakeMachine
 
 

@@ -27,7 +27,7 @@ from graderd.hal.settings import StopInputSettings
 from graderd.hal.stop_input import StopInput
 from graderd.runtime.stop_input import FIRST_WORD_S, StopInputWatch
 from graderd.simulator.stop_loop import StopLoop
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 from tests.contract.conformance import StopInputConformance, StopInputStand
 
 DEADLINE_S = 5.0

@@ -16,7 +16,7 @@ from graderd.hal.errors import DeviceError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 from tests.dynamixel_sim import bench, until
 
 TABLE = ControlTable.load("ph54_200_s500")

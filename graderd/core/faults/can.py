@@ -21,6 +21,13 @@ ROWS = (
         Reaction.DISARM,
     ),
     FaultRow(
+        "can.adapter_refuses",
+        "the CAN adapter does not send what it is given",
+        "it lost power for a moment and forgot its channel, its bit rate is not one it knows, or nobody acknowledges",
+        "graderd opens its channel again by itself; where that does not help, pull it and plug it in; then arm",
+        Reaction.DISARM,
+    ),
+    FaultRow(
         "can.bus_off",
         "the CAN controller has left the bus after too many errors",
         "a short circuit, a wrong bit rate somewhere, or missing terminators",
@@ -54,7 +61,7 @@ ROWS = (
     FaultRow(
         "can.cannot_claim",
         "graderd has no address on the CAN bus and may not send",
-        "its address is taken by a device of higher priority, and no other is free or allowed",
+        "its address is taken by a device of higher priority, and no other is free, allowed or left to it",
         "free the address or choose another source_address_n; then arm",
         Reaction.DISARM,
     ),

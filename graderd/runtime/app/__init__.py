@@ -26,12 +26,8 @@ def run_guard(config_path: Path | None) -> int:
     return run(config_path)
 
 
-def check_drivers(config: Config) -> None:
-    """See :func:`graderd.runtime.app.backends.check_plugins`; loads no driver where all are graderd's own."""
-    from graderd.hal.settings import PLUGIN, tag_of
+def problems(config: Config) -> list[str]:
+    """See :func:`graderd.runtime.app.check.problems`."""
+    from graderd.runtime.app.check import problems as find
 
-    sections = (config.rotation, config.lift_left, config.lift_right, config.tilt, config.camera, config.stop_input)
-    if any(tag_of(section) == PLUGIN for section in sections):
-        from graderd.runtime.app.backends import check_plugins
-
-        check_plugins(config)
+    return find(config)

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import json
 import logging
 import shutil
 import signal
-import sys
-import time
 from pathlib import Path
 
 from graderd.api.app import make_app
@@ -19,8 +16,11 @@ from graderd.core import commands as cmd
 from graderd.core.machine import Mode
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
-from graderd.runtime.app.backends import check_plugins
+from graderd.runtime.app.check import problems
 from graderd.runtime.app.devices import build_devices, build_stop_input
+from graderd.runtime.app.hang_watch import HangWatch
+from graderd.runtime.app.journal import set_up_logging
+from graderd.runtime.app.last_run import remember
 from graderd.runtime.app.services import build_services
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
 from graderd.runtime.control import ControlLoop
@@ -42,22 +42,24 @@ def run_daemon(config_path: Path | None, sim: bool, rig_dir: Path | None, as_jso
     set_up_logging(as_json)
     try:
         config = load(config_path)
-        check_plugins(config)
+        refusals = problems(config)
     except ConfigError as error:
-        for line in error.problems:
+        refusals = error.problems
+    if refusals:
+        for line in refusals:
             log.error("%s", line)
         return 2
-    problems: list[DeviceError] = []
+    failures: list[DeviceError] = []
     try:
-        asyncio.run(_main(config, sim, rig_dir))
+        asyncio.run(_main(config, config_path, sim, rig_dir))
     except* DeviceError as group:
-        problems = _leaves(group)
-    for problem in problems:
-        log.error("%s", problem)
-    return 1 if problems else 0
+        failures = _leaves(group)
+    for failure in failures:
+        log.error("%s", failure)
+    return 1 if failures else 0
 
 
-async def _main(config: Config, sim: bool, rig_dir: Path | None) -> None:
+async def _main(config: Config, source: Path | None, sim: bool, rig_dir: Path | None) -> None:
     rig: RigProcess | None = None
     own_directory: Path | None = None
     if sim and rig_dir is None:
@@ -69,7 +71,7 @@ async def _main(config: Config, sim: bool, rig_dir: Path | None) -> None:
             config = attach(config, rig.directory)
         elif rig_dir is not None:
             config = attach(config, rig_dir)
-        daemon = Daemon(config, rig)
+        daemon = Daemon(config, source, rig)
         # What was imported stays for good: a full collection that looked at it would hold up several ticks.
         gc.collect()
         gc.freeze()
@@ -84,11 +86,13 @@ async def _main(config: Config, sim: bool, rig_dir: Path | None) -> None:
 class Daemon:
     """Everything that runs, and the order in which it ends."""
 
-    def __init__(self, config: Config, rig: RigProcess | None = None) -> None:
+    def __init__(self, config: Config, source: Path | None, rig: RigProcess | None = None) -> None:
         clock = SystemClock()
         self._config = config
+        self._source = source
         self._rig = rig
         self._notifier = SystemdNotifier()
+        self._hang_watch = HangWatch()
         self._eyes = PerceptionSupervisor(
             config.camera, config.camera.calibration, config.perception, config.blade, clock
         )
@@ -115,6 +119,7 @@ class Daemon:
     def _after_tick(self) -> None:
         """Runs in the tick: nothing here may wait."""
         self._notifier.feed_watchdog()
+        self._hang_watch.ticked(self._loop.tick.now_s)
         self._port.published()
         tick = self._loop.tick
         self._recorder.take(tick.now_s, self._port.status)
@@ -134,6 +139,7 @@ class Daemon:
                 api = group.create_task(self._serve(answering), name="api")
                 # A second daemon learns here that the socket is taken: before it touches a device.
                 await answering.wait()
+                remember(self._config, self._source)
                 tasks = [
                     group.create_task(self._loop.run(), name="control-tick"),
                     group.create_task(self._eyes.run(), name="perception"),
@@ -154,6 +160,7 @@ class Daemon:
                 for task in tasks:
                     task.cancel()
         finally:
+            self._hang_watch.close()
             await self._close_devices()
             # Not earlier: a second signal, taken the default way, would end the process before the wires are safe.
             for number in (signal.SIGINT, signal.SIGTERM):
@@ -176,7 +183,8 @@ class Daemon:
     def _on_signal(self, number: int) -> None:
         name = signal.Signals(number).name
         self._notifier.stopping()
-        self._loop.stop_now(cmd.Stop(reason=f"{name} received"))
+        if not self._loop.end(f"{name} received"):
+            self._recorder.expect_stop()
         self._ended.set()
 
     async def _close_devices(self) -> None:
@@ -195,23 +203,6 @@ class Daemon:
         for result in await asyncio.gather(*(device.close() for device in devices), return_exceptions=True):
             if isinstance(result, Exception):
                 log.error("closing %s: %s", part, result)
-
-
-class _JsonLines(logging.Formatter):
-    def format(self, record: logging.LogRecord) -> str:
-        line = {"time": time.time(), "level": record.levelname.lower(), "event": "log", "message": record.getMessage()}
-        if record.exc_info:
-            line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line)
-
-
-def set_up_logging(as_json: bool) -> None:
-    """One line an event on stderr; the journal adds the time, a terminal gets it from us."""
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_JsonLines() if as_json else logging.Formatter("%(asctime)s %(levelname)-7s %(message)s"))
-    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
-    logging.getLogger("can").setLevel(logging.ERROR)
-    logging.getLogger("uvicorn").setLevel(logging.WARNING)
 
 
 def _leaves(group: BaseExceptionGroup[DeviceError]) -> list[DeviceError]:

@@ -6,7 +6,9 @@ from collections.abc import Callable
 
 from graderd.config import Config
 from graderd.drivers.backend import Parts
-from graderd.drivers.electrak.dump import candump_line
+from graderd.drivers.j1939.bus_health import BusEvent
+from graderd.drivers.j1939.can_logs import candump_line
+from graderd.drivers.j1939.ids import Frame
 from graderd.drivers.j1939.link import CanLink
 from graderd.hal.clock import Clock
 from graderd.hal.fault import DeviceFault
@@ -41,7 +43,16 @@ def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], Non
         link.publish_faults(faults, stopped=stopped)
 
     def watch_bus(listener: Callable[[str], None]) -> Callable[[], None]:
-        return link.tap(lambda frame, now_s: listener(candump_line(frame, now_s)))
+        def write(item: Frame | BusEvent, now_s: float) -> None:
+            listener(candump_line(item, now_s))
+
+        end_frames, end_events = link.tap(write), link.tap_events(write)
+
+        def end() -> None:
+            end_frames()
+            end_events()
+
+        return end
 
     return Devices(
         rotation=rotator,

@@ -9,32 +9,58 @@ from functools import partial
 from pathlib import Path
 
 from graderd.config import Config, ConfigError, load
+from graderd.hal.errors import DeviceError
 from graderd.runtime.app.backends import actuator_of, rotator_of
-from graderd.runtime.app.sim import attach
+from graderd.runtime.app.last_run import is_of, recall
 
 log = logging.getLogger("graderd.guard")
 
 
-def run_guard(config_path: Path | None, rig_dir: Path | None = None) -> int:
-    """Every driver's own safe-off: motion disabled on the CAN bus, the servo as ``rotation.torque_at_exit`` says.
+def run_guard(config_path: Path | None) -> int:
+    """Make the machine safe that the daemon last ran, else the one that ``config_path`` describes.
 
-    The wires do not wait for each other's success. Returns 0 if all were told, else 1; a configuration that
-    cannot be read is answered with the defaults, because a stop must not fail for a typing mistake.
+    Never raises: a stop must not fail for a typing mistake. Returns 0 if all were told, else 1.
     """
+    return make_safe(config_to_act_on(config_path))
+
+
+def config_to_act_on(config_path: Path | None) -> Config:
+    """The configuration the daemon last ran with: its wires are the ones that may move, even if the file was changed
+    since. Without one of this file, the file; where that cannot be used, what any daemon last ran with; the defaults.
+    """
+    config = None
     try:
         config = load(config_path)
     except ConfigError as error:
-        log.error("guard: configuration not usable, taking the defaults: %s", error.problems[0])
-        config = Config()
+        log.error("guard: configuration not usable: %s", error.problems[0])
+    except Exception:
+        log.exception("guard: configuration not usable")
+    last = recall(config.state.directory if config is not None else "")
+    if last is not None and (config is None or is_of(last, config_path)):
+        if last.config != config:
+            log.info("guard: acting on what the daemon last ran with, read from %s", last.source)
+        return last.config
+    if config is None:
+        log.error("guard: nothing is known of a former run: taking the defaults")
+    return config or Config()
+
+
+def make_safe(config: Config) -> int:
+    """Every driver's own safe-off: motion disabled on the CAN bus, the servo as ``rotation.torque_at_exit`` says.
+
+    The wires do not wait for each other's success. Returns 0 if all were told, else 1.
+    """
     failed = []
-    if rig_dir is not None:
-        config = attach(config, rig_dir)
     for name, action in _actions(config).items():
         try:
             log.info("guard: %s: %s", name, action())
-        except Exception as error:  # whatever one driver raises, the next one is asked too
+        except DeviceError as error:
             failed.append(name)
             log.error("guard: %s: %s", name, error)
+        except Exception:
+            # Whatever one driver raises, a mistake of ours among it, is no reason to leave the next.
+            failed.append(name)
+            log.exception("guard: %s", name)
     log.info("guard: %s", json.dumps({"failed": failed}))
     return 1 if failed else 0
 

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
+import asyncio
+import base64
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
-from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import Field, ValidationError
 
 from graderd.config import Config
 from graderd.drivers.dynamixel.step import StepSample, analyse, render
-from graderd.hal.errors import CommandRangeError, DeviceMissingError
+from graderd.hal.errors import CommandRangeError, DeviceMissingError, DeviceRefusedError
 from graderd.hal.rotator import Rotator
 from graderd.hal.service import DeviceService
 from graderd.hal.settings import Finite, Ph54Settings, Positive, RotatorSettings, Settings
+from graderd.runtime.app.calibration_frames import CalibrationFrames
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
 from graderd.runtime.maneuver import Maneuver
@@ -42,10 +42,17 @@ class CalibrateArguments(Settings):
     angles_deg: tuple[Finite, ...] = Field((-40.0, -20.0, 0.0, 20.0, 40.0), min_length=2, max_length=20)
 
 
+class FileArguments(Settings):
+    """Arguments of ``camera.calibration_file``."""
+
+    file: str
+
+
 def build_services(
     config: Config, devices: Devices, loop: ControlLoop, eyes: PerceptionSupervisor
 ) -> dict[str, DeviceService]:
     """The services by name."""
+    frames = CalibrationFrames(config.state.directory)
 
     async def step_response(arguments: dict[str, Any]) -> dict[str, Any]:
         wanted = _checked(StepArguments, arguments)
@@ -53,12 +60,18 @@ def build_services(
 
     async def calibrate(arguments: dict[str, Any]) -> dict[str, Any]:
         wanted = _checked(CalibrateArguments, arguments)
-        return await _collect_frames(config, loop, eyes, wanted)
+        return await _collect_frames(config, loop, eyes, frames, wanted)
+
+    async def calibration_file(arguments: dict[str, Any]) -> dict[str, Any]:
+        wanted = _checked(FileArguments, arguments)
+        # One file a request, encoded in a thread: the tick shares this loop.
+        return {"base64": await asyncio.to_thread(lambda: base64.b64encode(frames.take(wanted.file)).decode())}
 
     return {
         **devices.services,
         "rotation.step_response": DeviceService(step_response),
         "camera.calibrate": DeviceService(calibrate),
+        "camera.calibration_file": DeviceService(calibration_file, only_reads=True),
     }
 
 
@@ -117,25 +130,32 @@ def _own_figures(rotation: RotatorSettings) -> dict[str, str]:
 
 
 async def _collect_frames(
-    config: Config, loop: ControlLoop, eyes: PerceptionSupervisor, wanted: CalibrateArguments
+    config: Config, loop: ControlLoop, eyes: PerceptionSupervisor, frames: CalibrationFrames, wanted: CalibrateArguments
 ) -> dict[str, Any]:
-    """Turn the empty blade to each angle and save one frame there, as a frame set."""
+    """Turn the empty blade to each angle and save one frame there, as a frame set for the client to fetch."""
     limits = config.figures()["rotation"]
     for angle_deg in wanted.angles_deg:
         if not limits.low <= angle_deg <= limits.high:
             raise CommandRangeError("angles_deg", f"{angle_deg:g} is outside {limits.low:g} to {limits.high:g} deg")
-    base = os.environ.get("STATE_DIRECTORY") or None
-    folder = Path(tempfile.mkdtemp(prefix="calibration-", dir=base))
+    try:
+        folder = frames.begin()
+    except OSError as error:
+        cause = f"no room for the pictures ({error.strerror})"
+        raise DeviceRefusedError("camera", cause, "Make room where the daemon keeps its state") from None
     turn_s = max(abs(b - a) for a, b in zip((0.0, *wanted.angles_deg), wanted.angles_deg, strict=False))
     dwell_s = turn_s / limits.speed + limits.speed / limits.acceleration + 3 * SETTLE_S
-    async with Maneuver(loop) as blade:
-        for number, angle_deg in enumerate(wanted.angles_deg):
-            await blade.rotate_to(angle_deg, dwell_s)
-            measured_deg = loop.tick.pose.rotation_deg
-            if measured_deg is None:
-                raise DeviceMissingError("rotation", "no fresh measurement while calibrating")
-            await eyes.save_frame(folder, f"{number:03d}", measured_deg)
-    return {"frame_set": str(folder), "frames_n": len(wanted.angles_deg)}
+    try:
+        async with Maneuver(loop) as blade:
+            for number, angle_deg in enumerate(wanted.angles_deg):
+                await blade.rotate_to(angle_deg, dwell_s)
+                measured_deg = loop.tick.pose.rotation_deg
+                if measured_deg is None:
+                    raise DeviceMissingError("rotation", "no fresh measurement while calibrating")
+                await eyes.save_frame(folder, f"{number:03d}", measured_deg)
+    except BaseException:
+        frames.discard()
+        raise
+    return {"frame_set": folder.name, "frames_n": len(wanted.angles_deg), "files": frames.names()}
 
 
 def _checked(model: type[T], arguments: dict[str, Any]) -> T:

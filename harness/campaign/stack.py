@@ -13,11 +13,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import httpx
-
+from graderd.client import AsyncClient, ClientError, RefusedError
 from graderd.hal.errors import DeviceError
 from graderd.simulator.control_client import RigControl
-from tests.fault.campaign.watch import Watch
+from harness.campaign.watch import Watch
 
 START_S = 60.0
 CLIENT = "campaign"
@@ -80,11 +79,7 @@ class Stack:
         self._rig: asyncio.subprocess.Process | None = None
         self._daemon: asyncio.subprocess.Process | None = None
         self._control = RigControl(directory / "control.sock")
-        self.client = httpx.AsyncClient(
-            transport=httpx.AsyncHTTPTransport(uds=str(directory / "graderd.sock")),
-            base_url="http://graderd",
-            timeout=5.0,
-        )
+        self.client = AsyncClient(directory / "graderd.sock", name=CLIENT)
         self._mover: asyncio.Task[None] | None = None
         self._log_read = 0
 
@@ -111,7 +106,6 @@ class Stack:
                 except TimeoutError:
                     process.kill()
                     await process.wait()
-        await self.client.aclose()
         await self._control.close()
 
     async def start_rig(self) -> None:
@@ -138,7 +132,7 @@ class Stack:
         """Start the daemon; its log is appended to the former's."""
         with self.log_path.open("ab") as log:
             self._daemon = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "tests.fault.campaign.daemon"),
+                *(sys.executable, "-m", "harness.campaign.daemon"),
                 *("--config", str(self.config_path), "--rig-dir", str(self.directory)),
                 env=os.environ | {"GRADERD_CAMPAIGN_BREAK": self._broken, "STATE_DIRECTORY": ""},
                 stdout=log,
@@ -158,7 +152,7 @@ class Stack:
         return self._rig
 
     def hook(self, **wanted: float) -> None:
-        """Let the daemon do something to itself; see ``tests.fault.campaign.daemon``."""
+        """Let the daemon do something to itself; see ``harness.campaign.daemon``."""
         (self.directory / "hook.json").write_text(json.dumps(wanted), encoding="utf-8")
         self.daemon.send_signal(signal.SIGUSR1)
 
@@ -171,12 +165,9 @@ class Stack:
 
     async def guard(self) -> int:
         """Run ``graderd guard`` as systemd does after the daemon ended; returns its exit status."""
-        code = (
-            "import sys; from pathlib import Path; from graderd.runtime.app.guard import run_guard; "
-            "sys.exit(run_guard(Path(sys.argv[1]), Path(sys.argv[2])))"
-        )
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", code, str(self.config_path), str(self.directory)
+            *(sys.executable, "-m", "graderd", "guard", "--config", str(self.config_path)),
+            env=os.environ | {"STATE_DIRECTORY": ""},
         )
         return await process.wait()
 
@@ -191,29 +182,25 @@ class Stack:
     async def read_status(self) -> JsonObject | None:
         """The daemon's status now, None where it does not answer."""
         try:
-            response = await self.client.get("/v1/status")
-        except httpx.TransportError:
+            self.status = await self.client.get("/v1/status")
+        except ClientError:
             return None
-        if response.status_code != 200:
-            return None
-        self.status = response.json()
         return self.status
 
     async def command(self, name: str, /, **fields: Any) -> JsonObject:
         """One command; ``accepted`` tells whether it was obeyed. A reset names the stop that is latched now."""
         try:
-            if name == "reset":
-                fields = {"stop_n": (await self.client.get("/v1/status")).json()["stop_n"], **fields}
-            response = await self.client.post("/v1/commands", json={"command": name, "client": CLIENT, **fields})
-        except httpx.TransportError as error:
-            return {"accepted": False, "message": f"no answer: {error!r}"}
-        answer: JsonObject = response.json()
-        return {"accepted": False, **answer} if response.status_code != 200 else answer
+            reply = await (self.client.reset(**fields) if name == "reset" else self.client.command(name, **fields))
+        except ClientError as error:
+            return {"accepted": False, "error": error.cause, "where": error.where, "remedy": error.remedy}
+        return reply.model_dump()
 
     async def service(self, name: str, /, **arguments: Any) -> JsonObject:
         """One device service."""
-        answer: JsonObject = (await self.client.post(f"/v1/services/{name}", json=arguments)).json()
-        return answer
+        try:
+            return await self.client.service(name, **arguments)
+        except RefusedError as error:
+            return {"error": error.cause, "where": error.where, "remedy": error.remedy}
 
     async def until_status(
         self, reached: Callable[[JsonObject], bool], timeout_s: float, otherwise: str, poll_s: float = 0.02

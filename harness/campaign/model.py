@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tests.fault.campaign.stack import Stack
+    from harness.campaign.stack import Stack
 
 ROTATION = frozenset({"rotation"})
 LIFT = frozenset({"lift"})

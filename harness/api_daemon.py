@@ -29,7 +29,7 @@ from graderd.core.status import (
     Status,
 )
 from graderd.hal.lifecycle import Lifecycle
-from tests.awake_clock import AwakeClock
+from harness.awake_clock import AwakeClock
 
 T = TypeVar("T")
 
@@ -87,6 +87,10 @@ class FakeDaemon:
         return self._status
 
     async def command(self, command: cmd.Command) -> cmd.Reply:
+        if isinstance(command, cmd.Stop) and not self.frozen:
+            (reply,) = self._step([command])
+            self._status = self._make_status(self._clock.now_s())
+            return reply
         future: asyncio.Future[cmd.Reply] = asyncio.get_running_loop().create_future()
         self.waiting.append((command, future))
         return await future
@@ -120,26 +124,30 @@ class FakeDaemon:
         taken = [] if self.frozen else sorted(self.waiting, key=lambda entry: not isinstance(entry[0], cmd.Stop))
         if taken:
             self.waiting = []
-        self.seen += [command for command, _ in taken]
+        replies = self._step([command for command, _ in taken])
+        self._move()
+        self._status = self._make_status(now_s)
+        self._ticked.set()
+        self._ticked = asyncio.Event()
+        for (_, future), reply in zip(taken, replies, strict=True):
+            if not future.done():
+                future.set_result(reply)
+
+    def _step(self, commands: list[cmd.Command]) -> tuple[cmd.Reply, ...]:
+        self.seen += commands
         inputs = Inputs(
-            now_s=now_s,
+            now_s=self._clock.now_s(),
             resolve=self._resolve,
-            commands=tuple(command for command, _ in taken),
+            commands=tuple(commands),
             pose=self._pose(),
-            settled=not self._moving and not any(isinstance(command, cmd.Preset) for command, _ in taken),
+            settled=not self._moving and not any(isinstance(command, cmd.Preset) for command in commands),
             devices_active=self._active,
             unmet=self.unmet,
             faults=self.faults,
         )
         result = step(self.state, inputs, self.settings, RuleSettings())
         self.state, self._goals, self._active = result.state, result.intents.goals, result.intents.power
-        self._move()
-        self._status = self._make_status(now_s)
-        self._ticked.set()
-        self._ticked = asyncio.Event()
-        for (_, future), reply in zip(taken, result.replies, strict=True):
-            if not future.done():
-                future.set_result(reply)
+        return result.replies
 
     def _pose(self) -> Pose:
         return Pose(
@@ -298,3 +306,30 @@ async def serving(
         for task in reversed(tasks):
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
+
+
+@dataclass
+class Hold:
+    """``longest_s``: what was computed between two of our own turns in the event loop, the longest of them."""
+
+    longest_s: float = 0.0
+
+
+@asynccontextmanager
+async def longest_hold() -> AsyncIterator[Hold]:
+    """How long the event loop keeps a task waiting that sleeps for a tick, in computing time of this thread: waiting
+    for a processor that others have is not counted."""
+    hold = Hold()
+
+    async def look() -> None:
+        while True:
+            before_s = time.thread_time()
+            await asyncio.sleep(TICK_S)
+            hold.longest_s = max(hold.longest_s, time.thread_time() - before_s)
+
+    looking = asyncio.create_task(look(), name="longest hold")
+    try:
+        yield hold
+    finally:
+        looking.cancel()
+        await asyncio.gather(looking, return_exceptions=True)

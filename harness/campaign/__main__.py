@@ -1,4 +1,4 @@
-"""``python -m tests.fault.campaign``: run the campaign, print a table or one JSON line, write JSON and page."""
+"""``python -m harness.campaign``: run the campaign, print a table or one JSON line, write JSON and page."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from tests.fault.campaign.conduct import run_case
-from tests.fault.campaign.daemon import BREAKS
-from tests.fault.campaign.model import Case, Outcome, Phase
-from tests.fault.campaign.page import write
-from tests.fault.campaign.stack import Stack
-from tests.fault.campaign.table import ACTUATOR, CAMERA, CAN, SERVO
-from tests.fault.campaign.table_daemon import DAEMON, PERCEPTION
+from harness.campaign.conduct import run_case
+from harness.campaign.daemon import BREAKS
+from harness.campaign.model import Case, Outcome, Phase
+from harness.campaign.page import write
+from harness.campaign.stack import Stack
+from harness.campaign.table import ACTUATOR, CAMERA, CAN, SERVO
+from harness.campaign.table_daemon import DAEMON, PERCEPTION
 
 CASES: tuple[Case, ...] = (*CAMERA, *PERCEPTION, *SERVO, *CAN, *ACTUATOR, *DAEMON)
 PAGES = Path("docs/integrators")

@@ -1,4 +1,4 @@
-"""Writes the results as a page: ``python -m tests.fault.campaign --page`` (from a full run, or from its JSON file)."""
+"""Writes the results as a page: ``python -m harness.campaign --page`` (from a full run, or from its JSON file)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.fault.campaign.conduct import BRAKE_S, SLACK_S
-from tests.fault.campaign.model import Case, Phase
+from harness.campaign.conduct import BRAKE_S, SLACK_S
+from harness.campaign.model import Case, Phase
 
 HEAD = """\
 <!-- Written by `make faults ARGS="--page"` from fault-campaign.json beside it; do not edit. -->
@@ -19,7 +19,7 @@ The daemon as a process against the simulated grader, which speaks the real wire
 the machine stands armed (idle), while automatic operation turns the blade (turning), and while a preset moves both
 lifts, rotation and tilt together (coordinated lift). `make faults` runs it all, `make faults ARGS="--short --json"`
 the part that the tests run; a long run may be taken in parts (`--part 1/2 --output FILE`, at the end `--of FILE FILE`
-for this page). `tests/fault/campaign` is the code.
+for this page). `harness/campaign` is the code.
 
 What must happen is derived from the [fault catalogue](../operators/faults.md): reaction, axes held, and what ends the
 fault. What did happen is measured on the virtual devices themselves:

@@ -1,4 +1,6 @@
-"""Floods a socket with requests, as a process of its own: ``python -m tests.unit.api_flood SOCKET SECONDS KIND N``.
+"""Floods a socket with requests, as a process of its own: ``python -m harness.api_flood SOCKET SECONDS KIND N``.
+
+SOCKET: a unix socket's path, or HOST:PORT (then without a token).
 
 KIND ``ask``: N connections, each sends the next request as soon as it has the answer. ``hammer``: N workers, each
 connects, sends and hangs up without reading. ``stop``: like ``ask``, with stop commands. Prints one JSON object.
@@ -37,7 +39,7 @@ async def _client(path: str, end_s: float, kind: str, counts: Counter[str]) -> N
     loop = asyncio.get_running_loop()
     while loop.time() < end_s:
         try:
-            reader, writer = await asyncio.open_unix_connection(path)
+            reader, writer = await _connected(path)
         except OSError:
             counts["not connected"] += 1
             await asyncio.sleep(0.001)
@@ -59,5 +61,12 @@ async def _client(path: str, end_s: float, kind: str, counts: Counter[str]) -> N
             writer.close()
 
 
+async def _connected(target: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    if target.startswith("/"):
+        return await asyncio.open_unix_connection(target)
+    host, port = target.split(":")
+    return await asyncio.open_connection(host, int(port))
+
+
 if __name__ == "__main__":
-    print(json.dumps(asyncio.run(flood(sys.argv[1], float(sys.argv[2]), sys.argv[3], int(sys.argv[4])))))  # noqa: T201  (its one line of output)
+    print(json.dumps(asyncio.run(flood(sys.argv[1], float(sys.argv[2]), sys.argv[3], int(sys.argv[4])))))

@@ -1,4 +1,4 @@
-"""Damage for everything that reads text from outside: ``python -m benchmarks.fuzz_parsers [--strings N] [--seed N]``.
+"""Damage for everything that reads text from outside: ``python -m harness.fuzz_parsers [--strings N] [--seed N]``.
 
 Targets: configuration files and their migration, frame sets (manifest and camera file), names of firmware profiles,
 messages of the perception child, the state file, commands of clients and of the rig's. Each gets valid texts with bytes
@@ -23,7 +23,7 @@ import tomlkit
 from pydantic import TypeAdapter, ValidationError
 
 from graderd.config import Config, ConfigError, load
-from graderd.config.migrate import migrate_text, rename
+from graderd.config.migrate import STEPS, migrate_text, rename
 from graderd.core.blade import BladeGeometry
 from graderd.core.commands import AnyCommand, Command
 from graderd.core.soil import SoilObservation, Zone
@@ -81,12 +81,17 @@ def targets(directory: Path) -> dict[str, Target]:
     manifest, described = (frame_set / "manifest.csv").read_bytes(), (frame_set / "camera.json").read_bytes()
     seen = Observed.of(SoilObservation(1.0, Zone.LEFT, 0.5, "why", 0.9, 0.1, 0.0))
     config_text, old = _toml(Config()), b'version = 0\n[servo]\nport = "x"\n[actuators.left]\naddress_n = 5\n'
-    steps = {0: lambda document: rename(document, "servo", "rotation") + rename(document, "actuators.left", "lift")}
+    steps = {
+        **STEPS,
+        0: lambda document: rename(document, "servo", "rotation") + rename(document, "actuators.left", "lift"),
+    }
     config_path = directory / "g.toml"
     return {
         "config": Target((config_text,), _in_file(config_path, lambda: load(config_path)), (ConfigError,)),
         "migration": Target(
-            (config_text, old), lambda data: migrate_text(data.decode("utf-8", "replace"), steps), (ConfigError,)
+            (config_text, old),
+            lambda data: migrate_text(data.decode("utf-8", "replace"), steps),
+            (ConfigError,),
         ),
         "manifest": Target(
             (manifest,), _in_file(frame_set / "manifest.csv", lambda: FrameSet(frame_set)), (DeviceError,)

@@ -8,9 +8,9 @@ from contextlib import suppress
 
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import Clear, FaultRow, Reaction, catalogue_key
-from tests.fault.campaign.model import Case, Outcome, Phase
-from tests.fault.campaign.stack import CampaignError, JsonObject, Stack
-from tests.fault.campaign.watch import MOVING, axes_of
+from harness.campaign.model import Case, Outcome, Phase
+from harness.campaign.stack import CampaignError, JsonObject, Stack
+from harness.campaign.watch import MOVING, axes_of
 
 BRAKE_S = 0.7
 """Promised from detection (or from a ``manual`` command) to standstill: a tick, the wire, the way to stop."""

@@ -1,0 +1,158 @@
+"""Where the daemon's log goes: the systemd journal with its fields, JSON lines, or lines on a terminal.
+
+``extra={"device": …, "fault": …, "mode": …, "client": …}`` of a log call becomes fields of the journal entry
+(``GRADERD_DEVICE`` and so on, for ``journalctl GRADERD_DEVICE=rotation``) and of the JSON line. Whatever the way, text
+is made printable: a name that a client chose cannot end a line and begin another, nor command the reader's terminal.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import socket
+import sys
+import time
+from pathlib import Path
+
+from graderd.hal.repeats import RepeatFilter
+from graderd.hal.text import printable
+
+JOURNAL_SOCKET = Path("/run/systemd/journal/socket")
+FIELDS = ("device", "mode", "client", "fault")
+MESSAGE_MOST_BYTES = 32_768
+"""Longer than any text of ours; a datagram has to hold it."""
+
+
+def priority(level: int) -> int:
+    """A level of ``logging`` as syslog(3) counts: 2 critical, 3 error, 4 warning, 6 informational, 7 debug."""
+    for at_least, number in ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6)):
+        if level >= at_least:
+            return number
+    return 7
+
+
+def fields_of(record: logging.LogRecord) -> dict[str, str]:
+    """What the record says beside its message."""
+    found = {name: getattr(record, name, None) for name in FIELDS}
+    return {name: printable(str(value)) for name, value in found.items() if value}
+
+
+class _Line(logging.Formatter):
+    """One line an entry; only a traceback, which is ours, goes on over several."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  (as in logging)
+        record.message = printable(record.message)
+        return super().formatMessage(record)
+
+
+class _PriorityLine(_Line):
+    """A line as sd-daemon(3) reads it from standard error: its priority first, on every line of it."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        head = f"<{priority(record.levelno)}>"
+        return "\n".join(head + line for line in super().format(record).splitlines())
+
+
+class _JsonLine(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        line = {"time": time.time(), "level": record.levelname.lower(), "event": "log", "message": record.getMessage()}
+        line |= fields_of(record)
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line)
+
+
+class JournalHandler(logging.Handler):
+    """Sends each record as one datagram of journald's own protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL).
+
+    What the journal does not take (it is full, gone, or the entry too long) goes to ``otherwise``: never lost, never
+    waited for.
+
+    Raises:
+        OSError: there is no journal at ``address``.
+    """
+
+    def __init__(self, otherwise: logging.Handler, address: Path = JOURNAL_SOCKET) -> None:
+        super().__init__()
+        self._otherwise = otherwise
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        self._socket.setblocking(False)
+        try:
+            self._socket.connect(str(address))
+        except OSError:
+            self._socket.close()
+            raise
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send the record, or hand it on."""
+        try:
+            self._socket.send(journal_entry(record))
+        except OSError:
+            self._otherwise.handle(record)
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        self._socket.close()
+        super().close()
+
+
+def journal_entry(record: logging.LogRecord) -> bytes:
+    """The record as journald reads it."""
+    message = printable(record.getMessage())
+    if record.exc_info:
+        message += "\n" + logging.Formatter().formatException(record.exc_info)
+    values = {
+        "MESSAGE": message,
+        "PRIORITY": str(priority(record.levelno)),
+        "SYSLOG_IDENTIFIER": "graderd",
+        "LOGGER": record.name,
+        "CODE_FILE": record.pathname,
+        "CODE_LINE": str(record.lineno),
+        "CODE_FUNC": record.funcName or "",
+        **{f"GRADERD_{name.upper()}": value for name, value in fields_of(record).items()},
+    }
+    return b"".join(_field(name, value) for name, value in values.items())
+
+
+def _field(name: str, value: str) -> bytes:
+    """``NAME=value``; a value of several lines goes by its length, so that none of them can be taken for a field."""
+    data = value.encode("utf-8", "replace")[:MESSAGE_MOST_BYTES]
+    if b"\n" not in data:
+        return name.encode() + b"=" + data + b"\n"
+    return name.encode() + b"\n" + len(data).to_bytes(8, "little") + data + b"\n"
+
+
+def set_up_logging(as_json: bool) -> None:
+    """One line an event, repeated ones ever more rarely: to the journal where standard error is the journal's, else to
+    standard error (a terminal gets the time from us)."""
+    handler = _handler(as_json)
+    handler.addFilter(RepeatFilter())
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    logging.getLogger("graderd").setLevel(logging.INFO)
+    logging.getLogger("can").setLevel(logging.ERROR)
+
+
+def _handler(as_json: bool) -> logging.Handler:
+    lines = logging.StreamHandler(sys.stderr)
+    if as_json:
+        lines.setFormatter(_JsonLine())
+    elif not _stderr_is_the_journals():
+        lines.setFormatter(_Line("%(asctime)s %(levelname)-7s %(message)s"))
+    else:
+        lines.setFormatter(_PriorityLine("%(message)s"))
+        try:
+            return JournalHandler(lines)
+        except OSError:
+            return lines  # a journal that only reads what we print
+    return lines
+
+
+def _stderr_is_the_journals() -> bool:
+    """Whether what we print goes to the journal: systemd says which file that is, as DEVICE:INODE. A daemon that was
+    started by hand from a unit's shell inherits the variable and prints elsewhere."""
+    try:
+        status = os.fstat(sys.stderr.fileno())
+    except (OSError, ValueError):
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
