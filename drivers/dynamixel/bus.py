@@ -309,9 +309,10 @@ class ServoBus:
         """Send an instruction that nobody answers (broadcasts; a servo whose status return level is unknown)."""
         await self._access.take(False)
         try:
+            if servo_id != BROADCAST_ID:
+                self._suspect = True  # should it answer after all, that is not the next one's reply
             await self._transmit(encode(servo_id, instruction, params))
             await asyncio.sleep(self._byte_s * (12 + len(params)) + self._return_delay_s)
-            self._suspect = servo_id != BROADCAST_ID  # should it answer after all, that is not the next one's reply
         finally:
             self._access.give_back()
 
@@ -496,7 +497,7 @@ class ServoBus:
         elif self._everybody is not None:
             self._everybody.append(packet)
         elif reply is None or reply.done():
-            if packet.packet_id == self._wanted_id and not self._counters["timeouts_n"]:
+            if packet.packet_id == self._wanted_id and not self._suspect and not self._counters["timeouts_n"]:
                 counters["doubled_n"] += 1  # nothing was ever given up that could be late
             self._note_late()
         elif packet.packet_id != self._wanted_id:

@@ -213,6 +213,7 @@ class ServoLink:
             await asyncio.sleep(_LOOK_EVERY_S)
             try:
                 self.firmware_version = await device.identify(self._mode)
+                self._told.clear()  # what went unanswered meanwhile is no loss
                 return
             except DeviceTimeoutError:
                 if loop.time() > until_s:
