@@ -154,7 +154,7 @@ class Ph54Rotator:
         self._keeper.wake()
 
     def hold(self) -> None:
-        """Stop where the blade is: goal := measured with the next packet. Allowed in every state, idempotent."""
+        """Stop with the next packet, as soon as the blade can without turning back. Allowed always, idempotent."""
         self._command.hold()
         self._keeper.wake()
 
