@@ -18,6 +18,8 @@ blade rests after 0.75°."""
 _JUMP_DEG = 0.5
 _STILL_DEG_PER_S = 2.0
 _MEASURES_MOST_N = 4
+_SLOWEST_COUNTS = 1
+"""Profile velocity at torque-on: a servo that counts otherwise than it seemed has not moved when that is seen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +123,7 @@ async def _power_up(device: Ph54Device, settings: Ph54Settings, calibration: Cal
         "goal_current": wanted["current_limit"],
         "goal_velocity": limits["velocity_limit"],
         **profile,
+        "profile_velocity": _SLOWEST_COUNTS,
         "goal_position": measured,
     }
     await device.write_block(device.arm_block, goal)
@@ -134,7 +137,9 @@ async def _power_up(device: Ph54Device, settings: Ph54Settings, calibration: Cal
             f"its count is {calibration.servo_deg(present - measured) / 360.0:+.2f} turns off the goal it stands at",
             "Reboot the servo; 'graderd profile verify rotation' shows its mode",
         )
-    await device.confirm({"bus_watchdog": watchdog_counts(settings), "goal_position": measured}, device.goal_block)
+    move = {**profile, "goal_position": measured}
+    await device.write_block(device.profile_block, move)
+    await device.confirm({"bus_watchdog": watchdog_counts(settings), **move}, device.goal_block)
     return Armed(measured, hold["profile_acceleration"])
 
 
