@@ -52,9 +52,9 @@ class AxisStand(ABC):
     """An axis on its wire, and the truth about it. Positions are in the axis's unit.
 
     ``low``, ``high``: the soft limits it is configured with; it stands between them, nearer to ``low``. ``reached``:
-    of_the_wire: frozenset[str] = frozenset()
     how near to a goal it comes. ``still``: as much it may move while it stands. ``instant``: a fake that is where it is
-    told to be at once, so that nothing can be caught in the middle of a move.
+    told to be at once, so that nothing can be caught in the middle of a move. ``of_the_wire``: faults that the transport
+    under it brings about.
     """
 
     low: float
@@ -63,6 +63,7 @@ class AxisStand(ABC):
     still: float
     clock: Clock
     instant: ClassVar[bool] = False
+    of_the_wire: ClassVar[frozenset[str]] = frozenset()
 
     @property
     @abstractmethod
