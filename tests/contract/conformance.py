@@ -53,8 +53,8 @@ class AxisStand(ABC):
 
     ``low``, ``high``: the soft limits it is configured with; it stands between them, nearer to ``low``. ``reached``:
     how near to a goal it comes. ``still``: as much it may move while it stands. ``instant``: a fake that is where it is
-    told to be at once, so that nothing can be caught in the middle of a move. ``of_the_wire``: faults that the transport
-    under it brings about.
+    told to be at once, so that nothing can be caught in the middle of a move. ``of_the_wire``: faults that the
+    transport under it brings about.
     """
 
     low: float
