@@ -25,6 +25,9 @@ def _services(rotator: Ph54Rotator) -> Mapping[str, DeviceService]:
     async def verify_profile(_: dict[str, Any]) -> dict[str, Any]:
         return {"differences": [asdict(difference) for difference in await rotator.verify_profile()]}
 
+    async def scan(_: dict[str, Any]) -> dict[str, Any]:
+        return {"servos": [asdict(found) for found in await rotator.scan()]}
+
     async def reboot(_: dict[str, Any]) -> dict[str, Any]:
         await rotator.reboot()
         return {"rebooted": True}
@@ -35,6 +38,7 @@ def _services(rotator: Ph54Rotator) -> Mapping[str, DeviceService]:
 
     return {
         "verify_profile": DeviceService(verify_profile, only_reads=True),
+        "scan": DeviceService(scan),
         "reboot": DeviceService(reboot),
         "confirm_turns": DeviceService(confirm_turns),
     }

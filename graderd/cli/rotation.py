@@ -1,4 +1,4 @@
-"""``graderd rotation reboot | confirm-turns | step``: services of the servo that turns the blade."""
+"""``graderd rotation reboot | scan | confirm-turns | step``: services of the servo that turns the blade."""
 
 from __future__ import annotations
 
@@ -42,6 +42,23 @@ def register(app: typer.Typer) -> None:
             print_json(answer)
         else:
             print_text("the servo has restarted; arm when its alerts are gone")
+
+    @rotation.command(epilog=example("graderd rotation scan --yes"))
+    def scan(context: typer.Context, yes: Yes = False, json: Json = False) -> None:
+        """Find every servo on the wire: its baud rate, id, model and firmware.
+
+        Disarmed only. Nothing but pings is sent; the servo in use is lost for ten seconds and found again.
+        """
+        need_consent("rotation scan", "the servo is not watched for ten seconds", yes)
+        answer = client_of(context).service("rotation.scan", SERVICE_S, consent=True)
+        servos = answer.get("servos", [])
+        if json:
+            print_json(answer)
+        elif servos:
+            header = tuple(servos[0])
+            print_table("Servos", header, [tuple(str(servo[name]) for name in header) for servo in servos])
+        else:
+            print_text("no servo answers at any baud rate: check the 24 V supply and the RS-485 cable")
 
     @rotation.command(epilog=example("graderd rotation confirm-turns --yes"))
     def confirm_turns(context: typer.Context, yes: Yes = False, json: Json = False) -> None:

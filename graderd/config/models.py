@@ -277,6 +277,7 @@ class Config(Settings):
                 lead=rotation.lead_deg,
                 tolerance=rotation.tolerance_deg,
                 max_age_s=rotation.max_age_s,
+                profile_in_device=rotation.profile_in_device,
             ),
             **{name: _actuator_figures(section) for name, section in self.actuators().items()},
         }

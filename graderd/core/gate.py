@@ -1,8 +1,8 @@
 """The gate: the only way out. Every goal passes here, or the axis stays where it is.
 
 Order of the checks, the first that fails decides: mode, lease, finite number, fresh measurement, interlocks, then the
-bounds (absolute limits and the working window around the armed pose) and the motion limits (speed, acceleration, and
-how far the goal may run ahead of the measured position).
+bounds (absolute limits and the working window around the armed pose) and the motion limits (how far the goal may run
+ahead of the measured position; speed and acceleration where the device has no profile of its own).
 A goal beyond a bound is not "corrected": it is limited to the bound and the result says so.
 
 Of the lifts, the speed is the lift pair's: it is asked with the goals that may be gone to, and what it says passes
@@ -123,7 +123,10 @@ def pass_gate(
             advanced = replace(former, position=_bound(wanted, figures, former.armed_at)[0])
             setpoints[axis] = _lead(advanced, measured, figures, figures.lead)
         else:
-            advanced = _fence(_advance(former, wanted, figures, dt_s), former, figures)
+            if figures.profile_in_device:  # a second profile before the device's own would only fight it
+                advanced = replace(former, position=wanted, speed=0.0)
+            else:
+                advanced = _fence(_advance(former, wanted, figures, dt_s), former, figures)
             advanced = _watch(advanced, measured, figures, inputs.dt_s)
             setpoints[axis] = _lead(advanced, measured, figures, _lead_of(advanced, figures))
         passed[axis] = replace(result, limited=setpoints[axis].position)

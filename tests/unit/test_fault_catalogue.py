@@ -32,7 +32,7 @@ CONDITIONS = {
         "alert_electrical_shock alert_overload watchdog_tripped ram_reset turns_lost torque_off not_moving "
         "not_arriving overspeed moving_uncommanded wrong_way voltage_near_limit temperature_near_limit unplugged"
     ),
-    "servo_bus": "adapter_latency",
+    "servo_bus": "adapter_latency lossy",
     "actuator": (
         "no_feedback implausible_feedback feedback_flood overload parameter saturation backdrive fatal voltage "
         "temperature uncommanded_motion not_moving not_arriving overspeed restarted wrong_address thermal_derating "
@@ -169,7 +169,7 @@ def test_a_fault_counts_after_its_debounce_and_ends_as_the_row_says(row: FaultRo
         ("lift_left.overload", {"actuator.overload"}),
         ("actuator.overload", {"actuator.overload"}),
         ("not_moving", {"rotation.not_moving", "actuator.not_moving"}),
-        ("servo_bus", {"servo_bus.adapter_latency"}),
+        ("servo_bus", {"servo_bus.adapter_latency", "servo_bus.lossy"}),
         ("tilt", {key for key in CATALOGUE if key.startswith("actuator.")}),
         ("tilt.stale", set()),
         ("nonsense", set()),

@@ -163,9 +163,9 @@ async def test_many_tasks_share_the_wire_one_request_at_a_time(bus: ServoBus, se
     in_flight: list[int] = []
     transmit = bus._transmit
 
-    def watched(packet: bytes) -> None:
+    async def watched(packet: bytes) -> bool:
         in_flight.append(servos.requests_n - servos.replies_n)
-        transmit(packet)
+        return await transmit(packet)
 
     bus._transmit = watched  # type: ignore[method-assign]
     for servo in servos.servos:

@@ -12,7 +12,7 @@ from graderd.drivers.dynamixel import Ph54Rotator, ServoBus
 from graderd.drivers.dynamixel.codec import Instruction, Packet, StatusError, StreamDecoder
 from graderd.drivers.dynamixel.device import Ph54Device
 from graderd.drivers.dynamixel.table import ControlTable
-from graderd.hal.errors import DeviceError, DeviceTimeoutError, LifecycleError
+from graderd.hal.errors import DeviceError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
@@ -96,7 +96,7 @@ async def test_goals_are_sent_once_and_the_profile_only_after_a_hold(tmp_path: P
     goal_again = rotator.calibration.counts(6.0).to_bytes(4, "little", signed=True)
     await until(lambda: tap.writes(start)[-1][1].endswith(goal_again), "no goal after the hold")
     assert tap.writes(start)[-1][0] == PROFILE
-    assert held == 10 * int.from_bytes(tap.writes(start)[-1][1][:4], "little") == 6000
+    assert held == 10 * int.from_bytes(tap.writes(start)[-1][1][:4], "little") == 5000
     await rotator.close()
     await wire.close()
 
@@ -193,10 +193,11 @@ async def test_every_difference_is_listed_in_every_kind(tmp_path: Path) -> None:
         }
         assert "70" in found["temperature_limit"].text
         await rig.rotator.arm()
-        assert "current_limit" in {d.register for d in await rig.rotator.verify_profile()}
+        assert servo.memory["current_limit"] == 9300
         await rig.rotator.close()
-        with pytest.raises(LifecycleError):
-            await rig.rotator.verify_profile()
+        again = {d.register for d in await rig.rotator.verify_profile()}  # closed: the wire is taken for this alone
+        assert again == found.keys()  # what arming wrote is no difference
+        assert rig.rotator.port is None
 
 
 async def test_a_register_the_servo_does_not_know_is_a_difference(tmp_path: Path) -> None:
@@ -207,7 +208,7 @@ async def test_a_register_the_servo_does_not_know_is_a_difference(tmp_path: Path
     await wire.start()
     bus = ServoBus(str(tmp_path / "servo"), 57_600)
     bus.open()
-    (difference,) = await Ph54Device(bus, TABLE, 1).verify(3)
+    (difference,) = await Ph54Device(bus, TABLE, 1).verify(3, {})
     assert (difference.register, difference.kind, difference.device) == ("backup_ready", "refused", None)
     assert StatusError.ACCESS.name.lower() in difference.text
     bus.close()
