@@ -5,14 +5,17 @@ from __future__ import annotations
 import asyncio
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Body, Path, Response
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from fastapi import APIRouter, Body, Path, Request, Response
+from pydantic import JsonValue
+from starlette.requests import HTTPConnection
 
 from graderd.api.port import DaemonPort, ServiceError
 from graderd.api.problem import Problem, ProblemError
 from graderd.api.settings import ApiLimits
+from graderd.api.stop import StopLane
 from graderd.core.commands import AnyCommand, Command, Reply, Stop
 from graderd.core.status import Status
+from graderd.hal.text import printable
 
 COMMAND_EXAMPLES: dict[str, Any] = {
     "arm": {"summary": "Power the devices and hold", "value": {"command": "arm", "client": "cab"}},
@@ -35,13 +38,28 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
 }
 
 
-class StopRequest(BaseModel):
-    """Body of a stop; it may be left out."""
-
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"reason": "person near the blade"}]})
-
-    client: str = Field("", max_length=80, description="who asks")
-    reason: str = Field("stop request", max_length=200, description="kept as the reason of the stop")
+STOP_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": False,
+        "description": "may be left out; never a reason to refuse the stop",
+        "content": {
+            "application/json": {
+                "schema": {
+                    "type": "object",
+                    "properties": {
+                        "client": {"type": "string", "maxLength": 80, "description": "who asks"},
+                        "reason": {
+                            "type": "string",
+                            "maxLength": 200,
+                            "description": "kept as the reason of the stop; more is cut off",
+                        },
+                    },
+                },
+                "example": {"reason": "person near the blade"},
+            }
+        },
+    }
+}
 
 
 class StatusTexts:
@@ -57,8 +75,8 @@ class StatusTexts:
         return self._text
 
 
-def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts) -> APIRouter:
-    """The routes over ``port``."""
+def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: StopLane) -> APIRouter:
+    """The routes over ``port``; ``stops`` carries out what asks for a stop."""
     router = APIRouter(prefix="/v1")
 
     @router.get("/status", tags=["status"], summary="Everything at the last control tick", response_model=Status)
@@ -66,19 +84,24 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts) -> APIR
         return Response(texts.text(port.status()), media_type="application/json")
 
     @router.post("/commands", tags=["commands"], summary="Send one command", responses=PROBLEMS)
-    async def command(command: Annotated[AnyCommand, Body(openapi_examples=COMMAND_EXAMPLES)]) -> Reply:
+    async def command(
+        command: Annotated[AnyCommand, Body(openapi_examples=COMMAND_EXAMPLES)], request: Request
+    ) -> Reply:
         """The reply comes after the control tick that took the command.
 
-        A jog or preset moves only while its lease is renewed (`renew`, at least every 0.3 s, 0.1 s advised); the
-        WebSocket `/v1/jog` does that on one connection and gives the lease back when the connection ends.
+        A jog or preset moves only while its lease is renewed (`renew`, at least every 0.3 s, 0.1 s advised) on the
+        connection that asked for it: the daemon names connections, and `client` is only what people read. The
+        WebSocket `/v1/jog` does that too, and gives the lease back at once when the connection ends.
         """
-        return accepted(await obey(port, command, limits))
+        asked = command.model_copy(update={"client": name_of(command.client, request)})
+        return accepted(await obey(port, asked, limits))
 
-    @router.post("/stop", tags=["commands"], summary="End motion at once", responses={504: PROBLEMS[504]})
-    async def stop(request: StopRequest | None = None) -> Reply:
-        """Wins over everything, latches, may be repeated; served ahead of every other request."""
-        request = request or StopRequest()
-        return accepted(await obey(port, Stop(client=request.client, reason=request.reason), limits))
+    @router.post("/stop", tags=["commands"], summary="End motion at once", openapi_extra=STOP_BODY)
+    async def stop(request: Request) -> Reply:
+        """Wins over everything, latches, may be repeated; served ahead of every other request and never refused. The
+        request line is the stop: motion ends whatever the body is, which only says why; what was not understood of it
+        is told in `message`. Every other method does the same."""
+        return await stops.serve(request.receive)
 
     @router.get("/config", tags=["status"], summary="The configuration in force")
     async def config() -> dict[str, Any]:
@@ -122,12 +145,21 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts) -> APIR
     return router
 
 
+def name_of(given: str, connection: HTTPConnection) -> str:
+    """The name that a client's lease goes by: what it calls itself, and the number of its connection, which is the
+    daemon's to give and nobody else's."""
+    number = connection.client.port if connection.client is not None else 0
+    return f"{printable(given) or 'client'}#{number}"
+
+
 async def obey(port: DaemonPort, command: Command, limits: ApiLimits) -> Reply:
     """Hand a command over and wait for its reply, not for ever.
 
     Raises:
         ProblemError: 504, the control tick did not answer.
     """
+    if isinstance(command, Stop):
+        return port.stop(command)
     try:
         async with asyncio.timeout(limits.command_timeout_s):
             return await port.command(command)

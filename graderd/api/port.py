@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncGenerator
 from typing import Any, Protocol
 
-from graderd.core.commands import Command, Reply
+from graderd.core.commands import Command, Reply, Stop
 from graderd.core.status import Status
 
 
@@ -30,7 +30,11 @@ class DaemonPort(Protocol):
         ...
 
     async def command(self, command: Command) -> Reply:
-        """Hand a command to the next tick and wait for its reply. Stop is taken ahead of all others."""
+        """Hand a command to the next tick and wait for its reply."""
+        ...
+
+    def stop(self, command: Stop) -> Reply:
+        """Stop: every wire is told before this returns, and nothing is waited for."""
         ...
 
     def config(self) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import fcntl
 import grp
+import itertools
 import logging
 import os
 import socket
@@ -19,13 +20,13 @@ from typing import TYPE_CHECKING, Any, cast
 import h11
 import uvicorn
 from fastapi import FastAPI
-from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from graderd.api.limiter import Pace
-from graderd.api.problem import Problem, ProblemError
+from graderd.api.http_head import JudgedConnection, problem_of_head
+from graderd.api.pace import Pace
 from graderd.api.settings import ApiLimits, TcpSettings
+from graderd.api.stop import StopLane, is_stop_line
 from graderd.api.tcp_guard import TcpGuard, load_or_make_token
 from graderd.hal.errors import DeviceError
 
@@ -148,8 +149,6 @@ ACCEPT_BURST_N = 20
 ACCEPT_RETRY_S = 0.1
 LISTEN_QUEUE_N = 128
 STREAM_BUFFER_BYTES = 16_384
-HEAD_MAX_BYTES = 8192
-"""Request line and headers."""
 READ_BYTES = 1024
 """Some hundred of the smallest frames: a few milliseconds."""
 LINGER_S = 0.5
@@ -199,10 +198,10 @@ async def serve(
             await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _config(app: ASGIApp, limits: ApiLimits, guard: TcpGuard | None = None) -> uvicorn.Config:
+def _config(app: FastAPI, limits: ApiLimits, guard: TcpGuard | None = None) -> uvicorn.Config:
     return uvicorn.Config(
         app,
-        http=_bounded_http(limits, guard),
+        http=_bounded_http(limits, guard, app.state.stops),
         ws=_StreamProtocol,
         ws_max_size=limits.body_max_bytes_n,
         ws_per_message_deflate=False,
@@ -303,53 +302,15 @@ class _SmallReads(asyncio.BufferedProtocol):
             """What the protocol does with a piece."""
 
 
-class _JudgedConnection(h11.Connection):
-    """h11's parser, which gives nobody a request whose head was not judged: by its size, and by the guard."""
-
-    def __init__(self, guard: TcpGuard | None) -> None:
-        super().__init__(h11.SERVER, HEAD_MAX_BYTES)
-        self._guard = guard
-
-    def next_event(self) -> Any:
-        """As in h11.
-
-        Raises:
-            h11.RemoteProtocolError: no valid HTTP, or a head that is too long.
-            _RefusedError: the guard does not let it in.
-        """
-        event = super().next_event()
-        if isinstance(event, h11.Request):
-            size_n = len(event.target) + sum(len(name) + len(value) + 4 for name, value in event.headers)
-            if size_n > HEAD_MAX_BYTES:
-                raise h11.RemoteProtocolError("too long a head", error_status_hint=431)
-            refusal = self._guard.refusal(event.target, event.headers) if self._guard is not None else None
-            if refusal is not None:
-                raise _RefusedError(refusal)
-        return event
+_numbers = itertools.count(1)
 
 
-class _RefusedError(h11.RemoteProtocolError):
-    """A request that the guard does not let in, in the form in which uvicorn expects a parser to fail."""
-
-    def __init__(self, refusal: ProblemError) -> None:
-        super().__init__(str(refusal), refusal.status_code)
-        self.refusal = refusal
+def _numbered(client: tuple[str, int] | None) -> tuple[str, int]:
+    """Where a connection comes from, and a number that no other connection of this process has."""
+    return (client[0] if client is not None else "unix", next(_numbers))
 
 
-def _problem_of(error: BaseException | None) -> tuple[int, Problem]:
-    """What to answer where a request's head was not taken."""
-    if isinstance(error, _RefusedError):
-        return error.refusal.status_code, error.refusal.problem
-    if isinstance(error, h11.RemoteProtocolError) and error.error_status_hint == 431:
-        return 431, Problem(
-            error=f"the request's head is longer than {HEAD_MAX_BYTES} bytes",
-            where="request",
-            remedy="send fewer or shorter headers",
-        )
-    return 400, Problem(error="this is no valid HTTP request", where="request")
-
-
-def _bounded_http(limits: ApiLimits, guard: TcpGuard | None) -> type[H11Protocol]:
+def _bounded_http(limits: ApiLimits, guard: TcpGuard | None, stops: StopLane) -> type[H11Protocol]:
     """uvicorn's HTTP protocol with a bound on open connections: the oldest makes room for a new one, so that a client
     that wants to send stop gets in however many hang about."""
     open_connections: OrderedDict[H11Protocol, None] = OrderedDict()
@@ -357,11 +318,12 @@ def _bounded_http(limits: ApiLimits, guard: TcpGuard | None) -> type[H11Protocol
     class BoundedProtocol(_SmallReads, H11Protocol):
         def __init__(self, *args: Any, **kwargs: Any) -> None:
             super().__init__(*args, **kwargs)
-            self.conn = _JudgedConnection(guard)
+            self.conn = self._judged = JudgedConnection(guard)
             self._ending: asyncio.TimerHandle | None = None
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as in uvicorn
             super().connection_made(transport)
+            self.client = _numbered(self.client)
             open_connections[self] = None
             if len(open_connections) > limits.connections_max_n:
                 oldest, _ = open_connections.popitem(last=False)
@@ -380,8 +342,12 @@ def _bounded_http(limits: ApiLimits, guard: TcpGuard | None) -> type[H11Protocol
         def send_400_response(self, msg: str) -> None:
             """What was not taken is answered in the same form as everything else, as far as it can be answered."""
             del msg  # uvicorn's word for any of the reasons; the error under way knows which
-            status_code, problem = _problem_of(sys.exc_info()[1])
+            status_code, problem = problem_of_head(sys.exc_info()[1])
             body = problem.model_dump_json().encode()
+            if guard is None and is_stop_line(self._judged.line):
+                # Its line is the stop; who may open the unix socket may stop. On TCP a head without a valid token is
+                # nobody's.
+                status_code, body = 200, stops.at_once().model_dump_json().encode()
             length = str(len(body))
             headers = [("content-type", "application/json"), ("content-length", length), ("connection", "close")]
             response = h11.Response(status_code=status_code, headers=headers)
@@ -406,6 +372,7 @@ class _StreamProtocol(_SmallReads, WebSocketsSansIOProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
+        self.client = _numbered(self.client)
         self.transport.set_write_buffer_limits(high=0)
         connection = transport.get_extra_info("socket")
         if connection is not None:

@@ -69,10 +69,13 @@ class Port:
         return await future
 
     async def command(self, command: Command) -> Reply:
-        """Hand a command to the next tick; stop acts at once."""
-        reply = await self._loop.command(command)
-        if isinstance(command, Stop):
-            self._cached = None  # it acted between two ticks: who asks now sees the machine stopped
+        """Hand a command to the next tick."""
+        return await self._loop.command(command)
+
+    def stop(self, command: Stop) -> Reply:
+        """Every wire is told now, between two ticks: who asks afterwards sees the machine stopped."""
+        reply = self._loop.stop_now(command)
+        self._cached = None
         return reply
 
     def config(self) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from graderd.api.limiter import Pace
+from graderd.api.pace import Pace
 from graderd.api.settings import ApiLimits
 from graderd.core.machine import Mode
 from harness.api_daemon import TICK_S, serving, within

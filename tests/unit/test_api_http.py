@@ -86,7 +86,7 @@ MALFORMED: list[tuple[bytes, str]] = [
     (b"null", "body"),
     (b'"stop"', "body"),
     (b'{"command": "fly"}', "body"),
-    (b'{"command": "stop", "now": true}', "stop.now"),
+    (b'{"command": "manual", "now": true}', "manual.now"),
     (b'{"command": "jog", "axis": "rotate", "value": NaN}', "jog.value"),
     (b'{"command": "jog", "axis": "rotate", "value": Infinity}', "jog.value"),
     (b'{"command": "jog", "axis": "rotate", "value": 1e999}', "jog.value"),
@@ -113,7 +113,7 @@ async def test_malformed_commands_are_told_plainly_and_change_nothing(tmp_path: 
 
 async def test_a_large_body_is_refused_and_the_next_request_served(tmp_path: Path) -> None:
     async with serving(tmp_path) as (_, path), client_of(path) as client:
-        for target in ("/v1/commands", "/v1/stop", "/v1/services/rotation.reboot"):
+        for target in ("/v1/commands", "/v1/services/rotation.reboot"):
             answer = await client.post(target, content=b" " * 20_000)
             assert answer.status_code == 413
             assert "16384" in answer.json()["error"]
@@ -295,3 +295,18 @@ async def test_requests_that_wait_when_the_daemon_ends_are_answered(
     writer.close()
     await writer.wait_closed()
     assert [record for record in caplog.records if record.levelname == "ERROR"] == []
+
+
+@pytest.mark.parametrize("name", ["", "cab", "jog#1", "cab#1", "maneuver"])
+async def test_the_name_of_a_lease_is_the_daemons(tmp_path: Path, name: str) -> None:
+    """Whatever a client calls itself: nobody renews, moves or gives back on another connection's lease."""
+    jog = {"command": "jog", "axis": "rotate", "value": 50.0, "client": name}
+    async with serving(tmp_path) as (daemon, path), client_of(path) as one, client_of(path) as other:
+        await one.post("/v1/commands", json={"command": "arm"})
+        await daemon.until_mode(Mode.MANUAL)
+        assert (await one.post("/v1/commands", json=jog)).status_code == 200
+        assert daemon.state.lease is not None
+        for command in ({"command": "renew", "client": name}, {"command": "release", "client": name}, jog):
+            for taken in (name, daemon.state.lease.client):
+                assert (await other.post("/v1/commands", json={**command, "client": taken})).status_code == 409
+            assert (await one.post("/v1/commands", json={"command": "renew"})).status_code == 200
