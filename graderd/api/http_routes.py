@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import OrderedDict
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Path, Request, Response
@@ -38,6 +39,8 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
 }
 
 
+NAMES_N = 1000
+"""More than connections can be open."""
 STOP_BODY: dict[str, Any] = {
     "requestBody": {
         "required": False,
@@ -78,6 +81,7 @@ class StatusTexts:
 def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: StopLane) -> APIRouter:
     """The routes over ``port``; ``stops`` carries out what asks for a stop."""
     router = APIRouter(prefix="/v1")
+    names = ConnectionNames()
 
     @router.get("/status", tags=["status"], summary="Everything at the last control tick", response_model=Status)
     async def status() -> Response:
@@ -93,7 +97,7 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: 
         connection that asked for it: the daemon names connections, and `client` is only what people read. The
         WebSocket `/v1/jog` does that too, and gives the lease back at once when the connection ends.
         """
-        asked = command.model_copy(update={"client": name_of(command.client, request)})
+        asked = command.model_copy(update={"client": names.of(command.client, request)})
         return accepted(await obey(port, asked, limits))
 
     @router.post("/stop", tags=["commands"], summary="End motion at once", openapi_extra=STOP_BODY)
@@ -145,11 +149,21 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: 
     return router
 
 
-def name_of(given: str, connection: HTTPConnection) -> str:
-    """The name that a client's lease goes by: what it calls itself, and the number of its connection, which is the
-    daemon's to give and nobody else's."""
-    number = connection.client.port if connection.client is not None else 0
-    return f"{printable(given) or 'client'}#{number}"
+class ConnectionNames:
+    """The names that leases go by: what a client called itself first on its connection, and the number of that
+    connection, which is the daemon's to give and nobody else's."""
+
+    def __init__(self) -> None:
+        self._names: OrderedDict[int, str] = OrderedDict()
+
+    def of(self, given: str, connection: HTTPConnection) -> str:
+        """The name of whoever speaks on this connection."""
+        number = connection.client.port if connection.client is not None else 0
+        if number not in self._names:
+            self._names[number] = f"{printable(given) or 'client'}#{number}"
+            if len(self._names) > NAMES_N:
+                self._names.popitem(last=False)
+        return self._names[number]
 
 
 async def obey(port: DaemonPort, command: Command, limits: ApiLimits) -> Reply:

@@ -11,7 +11,7 @@ from fastapi import APIRouter, Query, WebSocket
 from pydantic import TypeAdapter, ValidationError
 from starlette.websockets import WebSocketDisconnect
 
-from graderd.api.http_routes import StatusTexts, name_of, obey
+from graderd.api.http_routes import ConnectionNames, StatusTexts, obey
 from graderd.api.limiter import Closing
 from graderd.api.port import DaemonPort
 from graderd.api.problem import Problem, ProblemError, problem_of_validation
@@ -45,7 +45,7 @@ def socket_routes(
     @router.websocket("/jog")
     async def jog(socket: WebSocket, client: Annotated[str, Query(max_length=60)] = "jog") -> None:
         await socket.accept()
-        session = _JogSession(port, limits, stops, name_of(client, socket))
+        session = _JogSession(port, limits, stops, ConnectionNames().of(client, socket))
         try:
             await _until_closed(socket, session.run(socket), closing)
         finally:

@@ -6,6 +6,7 @@ import asyncio
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -56,7 +57,7 @@ HEADS = {
 }
 
 
-async def answer_to(path: Path, sent: bytes) -> tuple[int, dict[str, str]]:
+async def answer_to(path: Path, sent: bytes) -> tuple[int, dict[str, Any]]:
     reader, writer = await asyncio.open_unix_connection(str(path))
     writer.write(sent)
     answer = await within(5, _read_answer(reader))
@@ -64,7 +65,7 @@ async def answer_to(path: Path, sent: bytes) -> tuple[int, dict[str, str]]:
     return answer
 
 
-async def _read_answer(reader: asyncio.StreamReader) -> tuple[int, dict[str, str]]:
+async def _read_answer(reader: asyncio.StreamReader) -> tuple[int, dict[str, Any]]:
     head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1").lower()
     length_n = int(head.split("content-length:", 1)[1].split("\r\n", 1)[0])
     return int(head.split(" ", 2)[1]), json.loads(await reader.readexactly(length_n))
