@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from collections import OrderedDict
-from typing import Annotated, Any
+from collections.abc import Coroutine
+from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Body, Path, Request, Response
-from pydantic import JsonValue
+from pydantic import Field, StrictBool, create_model
 from starlette.requests import HTTPConnection
 
 from graderd.api.port import DaemonPort, ServiceError
@@ -16,6 +17,7 @@ from graderd.api.settings import ApiLimits
 from graderd.api.stop import StopLane
 from graderd.core.commands import AnyCommand, Command, Reply, Stop
 from graderd.core.status import Status
+from graderd.hal.service import DeviceService
 from graderd.hal.text import printable
 
 COMMAND_EXAMPLES: dict[str, Any] = {
@@ -39,6 +41,9 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
 }
 
 
+NEEDS_CONSENT = """Wants `consent: true`, a disarmed machine, and no other such service under way."""
+ENDS_WITH_CLIENT = """ It ends, and the blade holds, when the connection that asked for it ends."""
+T = TypeVar("T")
 NAMES_N = 1000
 """More than connections can be open."""
 STOP_BODY: dict[str, Any] = {
@@ -125,28 +130,71 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: 
             raise ProblemError(404, error.message, "preview", error.remedy) from error
         return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
 
-    @router.post(
-        "/services/{name}",
-        tags=["services"],
-        summary="A device service outside the control loop",
-        responses={409: PROBLEMS[409], 422: PROBLEMS[422], 503: PROBLEMS[503]},
-    )
-    async def service(
-        name: Annotated[str, Path(max_length=80, pattern=r"^[a-z_.]+$", examples=["rotation.verify_profile"])],
-        arguments: Annotated[
-            dict[str, JsonValue] | None,
-            Body(openapi_examples={"reboot": {"summary": "Reboot the servo", "value": {"consent": True}}}),
-        ] = None,
-    ) -> dict[str, Any]:
-        """`rotation.verify_profile`, `rotation.reboot`, `rotation.step_response`, `camera.calibrate` (its pictures:
-        `camera.calibration_file`, once each). Those that move a device or take its power want `consent: true`: somebody
-        has looked and nobody is near the blade."""
-        try:
-            return await port.service(name, dict(arguments or {}))
-        except ServiceError as error:
-            raise ProblemError(409, error.message, name, error.remedy) from error
+    for name, offered in port.services().items():
+        _add_service(router, port, name, offered)
+
+    @router.post("/services/{name}", include_in_schema=False)
+    async def unknown_service(name: Annotated[str, Path(max_length=80, pattern=r"^[a-z_.]+$")]) -> dict[str, Any]:
+        return await _served(port, name, {})
 
     return router
+
+
+def _add_service(router: APIRouter, port: DaemonPort, name: str, offered: DeviceService) -> None:
+    """The route of one service, with its arguments as it describes them."""
+    consent: Any = (StrictBool, Field(False, description="somebody has looked and nobody is near the blade"))
+    fields = {} if offered.only_reads else {"consent": consent}
+    model = create_model(
+        f"{name.title().replace('.', '').replace('_', '')}Request", __base__=offered.arguments, **fields
+    )
+
+    async def service(request: Request, arguments: Any = None) -> dict[str, Any]:
+        given = {} if arguments is None else arguments.model_dump(exclude_unset=True)
+        return await _while_connected(request, _served(port, name, given))
+
+    service.__annotations__ = {
+        "request": Request,
+        "arguments": Annotated[model | None, Body()],
+        "return": dict[str, Any],
+    }
+    service.__doc__ = "" if offered.only_reads else NEEDS_CONSENT + ENDS_WITH_CLIENT * offered.moves
+    responses: dict[int | str, dict[str, Any]] = {number: PROBLEMS[number] for number in (409, 422, 503)}
+    router.add_api_route(
+        f"/services/{name}",
+        service,
+        methods=["POST"],
+        tags=["services"],
+        summary=offered.summary,
+        responses=responses,
+        operation_id=f"service_{name.replace('.', '_')}",
+    )
+
+
+async def _served(port: DaemonPort, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    try:
+        return await port.service(name, arguments)
+    except ServiceError as error:
+        raise ProblemError(409, error.message, name, error.remedy) from error
+
+
+async def _while_connected(request: Request, work: Coroutine[Any, Any, T]) -> T:
+    """The result of ``work``, which is cancelled, and waited for, when the client goes."""
+    working = asyncio.create_task(work, name=f"api {request.url.path}")
+    connected = asyncio.create_task(_disconnected(request), name=f"api {request.url.path} client")
+    try:
+        await asyncio.wait((working, connected), return_when=asyncio.FIRST_COMPLETED)
+        if not working.done():
+            raise ProblemError(409, "the client went away", request.url.path)
+        return working.result()
+    finally:
+        for task in (working, connected):
+            task.cancel()
+        await asyncio.gather(working, connected, return_exceptions=True)
+
+
+async def _disconnected(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
 
 
 class ConnectionNames:

@@ -152,6 +152,7 @@ STREAM_BUFFER_BYTES = 16_384
 READ_BYTES = 1024
 """Some hundred of the smallest frames: a few milliseconds."""
 LINGER_S = 0.5
+LOST_AFTER_S = 3
 
 
 async def serve(
@@ -268,12 +269,24 @@ class _Server(uvicorn.Server):
                 logging.getLogger(__name__).warning("%s: no connection taken: %s", self.name, error)
                 await asyncio.sleep(ACCEPT_RETRY_S)
                 continue
+            if connection.family != socket.AF_UNIX:
+                _notice_loss(connection)
             await loop.connect_accepted_socket(self._protocol, connection)
             await asyncio.sleep(self._pace.delay_s(loop.time()))
 
     def _protocol(self) -> asyncio.Protocol:
         protocol = cast("type[H11Protocol]", self.config.http_protocol_class)
         return protocol(config=self.config, server_state=self.server_state, app_state=self.lifespan.state)
+
+
+def _notice_loss(connection: socket.socket) -> None:
+    """Have the kernel end a connection whose other end has been gone for :data:`LOST_AFTER_S` without a word (its cable
+    pulled, its computer off): what it moves ends with it."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, LOST_AFTER_S - 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LOST_AFTER_S * 1000)
 
 
 class _SmallReads(asyncio.BufferedProtocol):
