@@ -35,7 +35,7 @@ lines.
 
 def make_app(port: DaemonPort, limits: ApiLimits | None = None) -> FastAPI:
     """The application. ``app.state.closing`` is its :class:`Closing`; whoever serves it tells it when to end.
-    ``app.state.stops`` carries out stops that come another way than through the application."""
+    ``app.state.stops`` carries out stops, ``app.state.stop_socket`` those of the socket that serves nothing else."""
     limits = limits or ApiLimits()
     app = FastAPI(
         title="graderd",
@@ -50,6 +50,7 @@ def make_app(port: DaemonPort, limits: ApiLimits | None = None) -> FastAPI:
     )
     app.state.closing = Closing()
     app.state.stops = StopLane(port, limits)
+    app.state.stop_socket = StopLane(port, limits)
     texts = StatusTexts()
     app.include_router(http_routes(port, limits, texts, app.state.stops))
     app.include_router(socket_routes(port, limits, texts, app.state.closing, app.state.stops))

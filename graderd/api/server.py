@@ -27,6 +27,7 @@ from graderd.api.http_head import JudgedConnection, problem_of_head
 from graderd.api.pace import Pace
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.api.stop import StopLane, is_stop_line
+from graderd.api.stop_socket import serving_stops, stop_socket_beside
 from graderd.api.tcp_guard import TcpGuard, load_or_make_token
 from graderd.hal.errors import DeviceError
 
@@ -132,15 +133,15 @@ def _group_id(group: str, where: str) -> int:
 
 
 @contextlib.contextmanager
-def tcp_socket(tcp: TcpSettings) -> Iterator[socket.socket]:
-    where = f"api tcp {tcp.host}:{tcp.port_n}"
-    family = socket.AF_INET6 if ":" in tcp.host else socket.AF_INET
+def tcp_socket(host: str, port_n: int) -> Iterator[socket.socket]:
+    where = f"api tcp {host}:{port_n}"
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listener.bind((tcp.host, tcp.port_n))
+            listener.bind((host, port_n))
         except OSError as error:
-            raise SocketError(where, str(error.strerror or error), "choose another host or port_n") from error
+            raise SocketError(where, str(error.strerror or error), "choose another host or port") from error
         listener.setblocking(False)
         yield listener
 
@@ -175,13 +176,19 @@ async def serve(
         DeviceError: the token file is not usable.
     """
     limits = limits or ApiLimits()
-    with contextlib.ExitStack() as stack:
+    stops: StopLane = app.state.stop_socket
+    async with contextlib.AsyncExitStack() as stack:
         listener = stack.enter_context(unix_socket(socket_path, socket_mode, socket_group))
         servers = [_Server(_config(app, limits), listener, limits)]
+        stop_listener = stack.enter_context(unix_socket(stop_socket_beside(socket_path), socket_mode, socket_group))
+        await stack.enter_async_context(serving_stops(stop_listener, stops))
         if tcp is not None:
-            listener = stack.enter_context(tcp_socket(tcp))
-            port_n = listener.getsockname()[1]
-            guard = TcpGuard(load_or_make_token(tcp.token_file), port_n, tcp.allowed_hosts)
+            listener = stack.enter_context(tcp_socket(tcp.host, tcp.port_n))
+            stop_listener = stack.enter_context(tcp_socket(tcp.host, tcp.port_of_stop_n()))
+            token = load_or_make_token(tcp.token_file)
+            ports = (listener.getsockname()[1], stop_listener.getsockname()[1])
+            guard, stop_guard = (TcpGuard(token, port_n, tcp.allowed_hosts) for port_n in ports)
+            await stack.enter_async_context(serving_stops(stop_listener, stops, stop_guard))
             servers.append(_Server(_config(app, limits, guard), listener, limits))
         tasks = [asyncio.create_task(server.run_until_told(), name=f"api server {server.name}") for server in servers]
         try:

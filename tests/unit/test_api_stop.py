@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from graderd.api.settings import TcpSettings
+from graderd.api.stop_socket import stop_socket_beside
 from graderd.core.machine import Mode
 from tests.unit.api_daemon import serving, within
 from tests.unit.test_api_sockets import connect
@@ -152,3 +155,65 @@ async def test_what_only_mentions_a_stop_is_none(tmp_path: Path) -> None:
         ):
             await answer_to(path, sent)
         assert daemon.state.mode is Mode.DISARMED
+
+
+@pytest.mark.parametrize(
+    ("said", "reason"),
+    [
+        (post(b"/v1/stop", b'{"reason": "near the blade", "client": "cab"}'), "near the blade (by cab)"),
+        (b"POST /v1/st", "stop request"),
+        (b"GET / HTTP/1.1\r\n\r\n", "stop request"),
+        (b"somebody is near the blade\n", "somebody is near the blade"),
+        (b"\x00", "\\x00"),
+        (post(b"/v1/stop", b"x" * 9000)[:-4000], "x" * 200),
+    ],
+)
+async def test_whatever_is_said_on_the_stop_socket_is_a_stop(tmp_path: Path, said: bytes, reason: str) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        status_code, reply = await answer_to(stop_socket_beside(path), said)
+        assert (status_code, reply["accepted"]) == (200, True)
+        assert daemon.state.mode is Mode.STOPPED
+        assert daemon.state.reason == reason
+
+
+async def test_a_stop_on_the_stop_socket_waits_for_nothing_and_counts_when_its_sender_is_gone(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        _, writer = await asyncio.open_unix_connection(str(stop_socket_beside(path)))
+        writer.write(b"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\nContent-Length: 50\r\n\r\n{")
+        await daemon.until_mode(Mode.STOPPED)
+        stop_n = daemon.state.stop_n
+        writer.close()
+        _, writer = await asyncio.open_unix_connection(str(stop_socket_beside(path)))
+        writer.write(b"!")
+        writer.close()
+        await daemon.until(lambda: daemon.state.stop_n > stop_n)
+
+
+async def test_who_only_connects_to_the_stop_socket_stops_nothing(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        reader, writer = await asyncio.open_unix_connection(str(stop_socket_beside(path)))
+        writer.write_eof()
+        assert await within(5, reader.read()) == b""
+        writer.close()
+        assert daemon.state.mode is Mode.DISARMED
+
+
+async def test_the_stop_port_needs_the_token(tmp_path: Path) -> None:
+    port_n = free_port()
+    tcp = TcpSettings(port_n=0, stop_port_n=port_n, token_file=tmp_path / "token")
+    async with serving(tmp_path, tcp=tcp) as (daemon, _):
+        token = (tmp_path / "token").read_text("ascii").strip()
+        for given, status_code in (("", 401), (f"Authorization: Bearer {token}\r\n", 200)):
+            reader, writer = await asyncio.open_connection("127.0.0.1", port_n)
+            assert daemon.state.mode is Mode.DISARMED
+            writer.write(f"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\n{given}\r\n".encode())
+            assert (await within(5, _read_answer(reader)))[0] == status_code
+            writer.close()
+        assert daemon.state.mode is Mode.STOPPED
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port_n: int = probe.getsockname()[1]
+        return port_n
