@@ -19,6 +19,8 @@ from graderd.api.http_head import JudgedConnection, problem_of_head
 from graderd.api.stop import GRACE_S, StopLane
 from graderd.api.tcp_guard import TcpGuard
 
+STOP_SUFFIX = ".stop"
+"""The client has it too, which may load nothing of the interface: a test holds them together."""
 QUEUE_N = 16
 """Taken at once in one turn of the event loop; more wait in the kernel."""
 OPEN_N = 64
@@ -28,7 +30,7 @@ PATIENCE_S = 5.0
 
 def stop_socket_beside(path: Path) -> Path:
     """Where the stop socket of the interface at ``path`` is: ``graderd.stop`` beside ``graderd.sock``."""
-    return path.with_suffix(".stop")
+    return path.with_suffix(STOP_SUFFIX)
 
 
 @contextlib.asynccontextmanager

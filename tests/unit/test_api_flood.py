@@ -81,7 +81,7 @@ async def test_the_stop_socket_is_nobodys_queue(tmp_path: Path, kind: str, conne
     """From a new process's connect to its answer, beside clients that fill the queue of the interface itself."""
     async with serving(tmp_path) as (daemon, path):
         flood = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "tests.unit.api_flood", str(path), "4", kind, str(connections_n)),
+            *(sys.executable, "-m", "harness.api_flood", str(path), "4", kind, str(connections_n)),
             stdout=asyncio.subprocess.PIPE,
         )
         await asyncio.sleep(1.5)  # the flood's own start

@@ -11,10 +11,13 @@ from typing import Any
 
 import pytest
 
-from graderd.api.settings import TcpSettings
+from graderd import client
+from graderd.api import stop_socket
+from graderd.api.server import ACCEPT_BURST_N
+from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.api.stop_socket import stop_socket_beside
 from graderd.core.machine import Mode
-from tests.unit.api_daemon import serving, within
+from harness.api_daemon import serving, within
 from tests.unit.test_api_sockets import connect
 
 LONG = "x" * 20_000
@@ -187,6 +190,17 @@ async def test_a_stop_on_the_stop_socket_waits_for_nothing_and_counts_when_its_s
         writer.write(b"!")
         writer.close()
         await daemon.until(lambda: daemon.state.stop_n > stop_n)
+
+
+async def test_the_client_takes_the_stop_socket(tmp_path: Path) -> None:
+    assert client.STOP_SUFFIX == stop_socket.STOP_SUFFIX
+    async with serving(tmp_path, limits=ApiLimits(accept_rate_hz=1e-3)) as (daemon, path):
+        for _ in range(ACCEPT_BURST_N + 1):  # the interface itself takes nobody any more
+            _, writer = await asyncio.open_unix_connection(str(path))
+            writer.close()
+        reply = await within(5, asyncio.to_thread(client.Client(path).stop, "by the other way"))
+        assert reply.accepted
+        assert "by the other way" in daemon.state.reason
 
 
 async def test_who_only_connects_to_the_stop_socket_stops_nothing(tmp_path: Path) -> None:
