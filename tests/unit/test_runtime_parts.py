@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import socket
 import time
 from pathlib import Path
@@ -25,7 +26,9 @@ STATUS = Status(
 
 
 def test_the_last_stop_survives_a_restart(tmp_path: Path) -> None:
-    StateFile(str(tmp_path / "new")).save("dog on the site")
+    state = StateFile(str(tmp_path / "new"))
+    state.save("dog on the site")
+    assert state.settle()
     found = StateFile(str(tmp_path / "new")).load()
     assert found is not None
     assert found.reason == "dog on the site"
@@ -44,6 +47,7 @@ def test_a_damaged_state_file_is_set_aside_and_told(tmp_path: Path, content: byt
     assert (tmp_path / "last_stop.damaged").read_bytes() == content
     assert not path.exists()
     state.save("next")
+    assert state.settle()
     assert state.problem == ""
 
 
@@ -51,7 +55,27 @@ def test_a_state_directory_that_cannot_be_written_is_told_and_raises_nothing(tmp
     (tmp_path / "file").write_text("", encoding="utf-8")
     state = StateFile(str(tmp_path / "file" / "state"))
     assert state.save("x").reason == "x"
+    assert state.settle()
     assert state.problem
+
+
+def test_a_state_directory_that_stalls_is_not_waited_for_and_told(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "last_stop.new")  # a file whose opening hangs, as on a disk that does not answer
+    state = StateFile(str(tmp_path))
+    began_s = time.monotonic()
+    for reason in ("one", "two", "three"):
+        assert state.save(reason).reason == reason
+    assert time.monotonic() - began_s < 0.1
+    assert not state.settle(0.05)
+    assert "takes long" in state.problem
+    with (tmp_path / "last_stop.new").open("rb"):  # the disk is back
+        assert state.settle()
+    assert state.problem == ""
+    state.save("four")
+    assert state.settle()
+    last = state.load()
+    assert last is not None
+    assert last.reason == "four"
 
 
 def test_systemd_is_told_ready_status_watchdog_and_stopping(tmp_path: Path) -> None:

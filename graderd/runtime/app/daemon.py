@@ -97,7 +97,8 @@ class Daemon:
             config.camera, config.camera.calibration, config.perception, config.blade, clock
         )
         self._devices = build_devices(config, clock, on_bus_stop=self._stop_from_bus)
-        self._loop = ControlLoop(config, self._devices, self._eyes, clock, StateFile(config.state.directory))
+        self._state_file = StateFile(config.state.directory)
+        self._loop = ControlLoop(config, self._devices, self._eyes, clock, self._state_file)
         services = build_services(config, self._devices, self._loop, self._eyes)
         self._port = Port(config, self._loop, self._devices, self._eyes, services)
         self._recorder = Recorder(config)
@@ -162,6 +163,7 @@ class Daemon:
         finally:
             self._hang_watch.close()
             await self._close_devices()
+            self._state_file.settle()
             # Not earlier: a second signal, taken the default way, would end the process before the wires are safe.
             for number in (signal.SIGINT, signal.SIGTERM):
                 running.remove_signal_handler(number)
