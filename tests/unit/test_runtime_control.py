@@ -154,6 +154,16 @@ async def test_after_a_stop_and_a_restart_reset_comes_first(bench: Bench, tmp_pa
     assert Bench(tmp_path).loop.tick.state.mode is Mode.DISARMED
 
 
+async def test_after_a_freeze_the_reason_is_the_freeze(bench: Bench) -> None:
+    await bench.arm()
+    bench.machine.clock.advance(1.5)
+    bench.machine.rotation.lose()
+    bench.loop.turn(late_s=1.5)
+    assert bench.loop.tick.state.mode is Mode.DISARMED
+    assert bench.loop.tick.state.reason.startswith("daemon.loop_blocked: ")
+    assert {"daemon.loop_blocked", "rotation.no_reply"} <= {fault.name for fault in bench.loop.tick.faults}
+
+
 async def test_the_wires_come_before_the_log_and_the_state_file(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     await bench.arm()
     order = bench.machine.log
