@@ -13,7 +13,8 @@ import socket
 import stat
 import sys
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -32,6 +33,9 @@ from graderd.api.tcp_guard import TcpGuard, load_or_make_token
 from graderd.hal.errors import DeviceError
 
 MAX_PATH_BYTES = 107
+LOOK_AFTER_FILE_S = 1.0
+
+log = logging.getLogger(__name__)
 
 
 class SocketInUseError(DeviceError):
@@ -56,7 +60,8 @@ def unix_socket(path: Path, mode: int, group: str | None) -> Iterator[socket.soc
         raise SocketError(where, f"the path is longer than {MAX_PATH_BYTES} bytes", "choose a shorter one")
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(_lock(path))
+            if not _is_locked_by_us(path):
+                stack.enter_context(_lock(path))
             _remove_stale(path)
             listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
             # Linux takes the rights of the new file from the socket: nobody else gets in before they are set for good.
@@ -72,6 +77,16 @@ def unix_socket(path: Path, mode: int, group: str | None) -> Iterator[socket.soc
             ) from error
         listener.setblocking(False)
         yield listener
+
+
+def _is_locked_by_us(path: Path) -> bool:
+    """Whether this process holds the lock already: the socket file alone was taken away, and is made again."""
+    held = _locks.get(path)
+    lock_path = path.with_name(path.name + ".lock")
+    return held is not None and lock_path.exists() and os.path.samestat(os.fstat(held), lock_path.stat())
+
+
+_locks: dict[Path, int] = {}
 
 
 @contextlib.contextmanager
@@ -97,8 +112,11 @@ def _lock(path: Path) -> Iterator[None]:
     try:
         os.truncate(descriptor, 0)
         os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        _locks[path] = descriptor
         yield
     finally:
+        if _locks.get(path) == descriptor:
+            del _locks[path]
         lock_path.unlink(missing_ok=True)
         os.close(descriptor)
 
@@ -191,6 +209,17 @@ async def serve(
             await stack.enter_async_context(serving_stops(stop_listener, stops, stop_guard))
             servers.append(_Server(_config(app, limits, guard), listener, limits))
         tasks = [asyncio.create_task(server.run_until_told(), name=f"api server {server.name}") for server in servers]
+
+        async def serve_again(listener: socket.socket) -> None:
+            servers[0].accept_also(listener)
+
+        async def serve_stops_again(listener: socket.socket) -> None:
+            await stack.enter_async_context(serving_stops(listener, stops))
+
+        for path, serve_on in ((socket_path, serve_again), (stop_socket_beside(socket_path), serve_stops_again)):
+            make = partial(unix_socket, path, socket_mode, socket_group)
+            keeping = _keep_socket_file(path, make, serve_on, stack)
+            tasks.append(asyncio.create_task(keeping, name=f"api socket file {path.name}"))
         try:
             for server in servers:
                 await server.answering.wait()
@@ -203,7 +232,41 @@ async def serve(
             app.state.closing.begin()
             for server in servers:
                 server.should_exit = True
+            for task in tasks[len(servers) :]:
+                task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _keep_socket_file(
+    path: Path,
+    make: Callable[[], contextlib.AbstractContextManager[socket.socket]],
+    serve_on: Callable[[socket.socket], Awaitable[None]],
+    stack: contextlib.AsyncExitStack,
+) -> None:
+    """Make the socket file again when somebody has taken it away: clients, and a stop, would find nobody. Who is
+    connected stays so."""
+    ours = _identity(path)
+    while True:
+        await asyncio.sleep(LOOK_AFTER_FILE_S)
+        if ours is not None and _identity(path) == ours:
+            continue
+        try:
+            listener = stack.enter_context(make())
+            ours = _identity(path)
+        except (OSError, SocketError) as error:
+            log.warning("%s was taken away and cannot be made again: %s", path, error)
+            continue
+        await serve_on(listener)
+        log.warning("%s was taken away: made again", path)
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Which file is there; None: there is none."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def _config(app: FastAPI, limits: ApiLimits, guard: TcpGuard | None = None) -> uvicorn.Config:
@@ -233,6 +296,7 @@ class _Server(uvicorn.Server):
         super().__init__(config)
         self._listener = listener
         self._pace = Pace(limits.accept_rate_hz, ACCEPT_BURST_N)
+        self._also_accepting: list[asyncio.Task[None]] = []
         self.answering = asyncio.Event()
         self.name = str(listener.getsockname())
 
@@ -243,14 +307,15 @@ class _Server(uvicorn.Server):
     async def run_until_told(self) -> None:
         """Serve until ``should_exit``."""
         serving = asyncio.create_task(self.serve(), name=f"api serve {self.name}")
-        accepting = asyncio.create_task(self._accept(), name=f"api accept {self.name}")
+        accepting = asyncio.create_task(self._accept(self._listener), name=f"api accept {self.name}")
         try:
             # Neither ends by itself: the first that does has failed, or was told to.
             await asyncio.wait((accepting, serving), return_when=asyncio.FIRST_COMPLETED)
         finally:
             self.should_exit = True
-            accepting.cancel()
-            results = await asyncio.gather(accepting, serving, return_exceptions=True)
+            for task in (accepting, *self._also_accepting):
+                task.cancel()
+            results = await asyncio.gather(accepting, *self._also_accepting, serving, return_exceptions=True)
         for result in results:
             if isinstance(result, Exception):
                 raise result
@@ -264,16 +329,21 @@ class _Server(uvicorn.Server):
         self._listener.listen(LISTEN_QUEUE_N)
         self.answering.set()
 
-    async def _accept(self) -> None:
+    def accept_also(self, listener: socket.socket) -> None:
+        """Take connections from a further socket."""
+        listener.listen(LISTEN_QUEUE_N)
+        self._also_accepting.append(asyncio.create_task(self._accept(listener), name=f"api accept again {self.name}"))
+
+    async def _accept(self, listener: socket.socket) -> None:
         loop = asyncio.get_running_loop()
         await self.answering.wait()
         while True:
             try:
-                connection, _ = await loop.sock_accept(self._listener)
+                connection, _ = await loop.sock_accept(listener)
             except ConnectionError:
                 continue
             except OSError as error:
-                logging.getLogger(__name__).warning("%s: no connection taken: %s", self.name, error)
+                log.warning("%s: no connection taken: %s", self.name, error)
                 await asyncio.sleep(ACCEPT_RETRY_S)
                 continue
             if connection.family != socket.AF_UNIX:

@@ -84,7 +84,11 @@ class StateFile:
                 return
             self._writing = True
         # Not one of a pool: a pool waits for its threads at the end of the process.
-        threading.Thread(target=self._write_all, args=(self._path,), name="state-file", daemon=True).start()
+        try:
+            threading.Thread(target=self._write_all, args=(self._path,), name="state-file", daemon=True).start()
+        except RuntimeError as error:  # no more threads
+            self._writing = False
+            self.problem = f"{self._path}: {error}"
 
     def _write_all(self, path: Path) -> None:
         """Write the newest until there is nothing newer."""

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 from graderd import client
-from graderd.api import stop_socket
+from graderd.api import server, stop_socket
+from graderd.api.app import make_app
 from graderd.api.server import ACCEPT_BURST_N
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.api.stop_socket import stop_socket_beside
@@ -231,3 +232,26 @@ def free_port() -> int:
         probe.bind(("127.0.0.1", 0))
         port_n: int = probe.getsockname()[1]
         return port_n
+
+
+async def test_a_socket_file_that_is_taken_away_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "LOOK_AFTER_FILE_S", 0.02)
+    async with serving(tmp_path) as (daemon, path), connect(path, "/v1/jog") as socket:
+        for file in (path, stop_socket_beside(path)):
+            rights = file.stat().st_mode
+            file.unlink()
+            await daemon.until(file.is_socket)
+            await daemon.until(lambda mode=rights, file=file: file.stat().st_mode == mode)  # type: ignore[misc]  # ours
+        for file in (path, path.with_name(path.name + ".lock")):
+            file.unlink()
+        await daemon.until(path.is_socket)
+        status_code, _ = await answer_to(path, b"GET /v1/status HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert status_code == 200
+        await socket.send(b'{"command": "renew"}')  # who was connected still is
+        assert "lease" in str(await within(5, socket.recv()))
+        with pytest.raises(server.SocketInUseError):
+            await server.serve(make_app(daemon), path)
+        await answer_to(stop_socket_beside(path), b"taken away")
+        assert daemon.state.reason == "taken away"
+    assert not path.exists()
+    assert not stop_socket_beside(path).exists()
