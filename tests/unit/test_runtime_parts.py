@@ -13,12 +13,15 @@ import pytest
 
 from graderd.config import Config, parse
 from graderd.core.machine import Mode
-from graderd.core.status import FaultStatus, Status
+from graderd.core.soil import Zone
+from graderd.core.status import CameraStatus, FaultStatus, Status
 from graderd.runtime.app.perception_child import AngleHistory, settings_not_kept
 from graderd.runtime.health import HealthWatch
 from graderd.runtime.recorder import Recorder
 from graderd.runtime.sd_notify import SystemdNotifier
 from graderd.runtime.state_file import StateFile
+from graderd.runtime.status import build_status
+from tests.unit.test_runtime_control import Bench
 
 STATUS = Status(
     time_s=1.0, wall_time="2026-01-01T00:00:00Z", version="0", simulated=True, mode=Mode.DISARMED, reason="t"
@@ -291,3 +294,32 @@ def test_settings_the_camera_did_not_take_are_named() -> None:
     (wrong,) = settings_not_kept(camera, {"exposure_us": 8000.0, "white_balance_k": 5500.0})
     assert "white_balance_k" in wrong
     assert settings_not_kept(camera, {}) == ()
+
+
+class _Eyes:
+    """Its camera gives nothing any more."""
+
+    frames_per_s = 0.0
+
+    def status(self) -> CameraStatus:
+        return CameraStatus()
+
+
+async def test_what_is_past_its_age_is_told_as_unknown(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    await bench.ticks(5, zone=Zone.LEFT, share_left=1.0, volume_left_l=3.0)
+    told = build_status(Config(), bench.loop, _Eyes())  # type: ignore[arg-type]  # all that is asked of it
+    assert (told.soil.zone, told.soil.share_left, told.soil.volume_left_l) == (Zone.LEFT, 1.0, 3.0)
+    assert told.axes["rotation"].measured is not None
+    bench.machine.rotation.lose()
+    await bench.ticks(200)
+    told = build_status(Config(), bench.loop, _Eyes())  # type: ignore[arg-type]  # as above
+    assert (told.soil.zone, told.soil.confidence, told.soil.share_left, told.soil.volume_left_l) == (
+        Zone.UNKNOWN, 0.0, 0.0, None
+    )  # fmt: skip
+    assert told.soil.age_s is not None
+    assert told.soil.age_s > 3.0
+    lost = told.axes["rotation"]
+    assert (lost.measured, lost.velocity_per_s, lost.moving) == (None, None, None)
+    assert lost.measured_age_s is not None
+    assert lost.measured_age_s > 3.0
