@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 from collections.abc import Coroutine
 from typing import Annotated, Any
 
@@ -12,29 +11,31 @@ from fastapi import APIRouter, Query, WebSocket
 from pydantic import TypeAdapter, ValidationError
 from starlette.websockets import WebSocketDisconnect
 
-from graderd.api.http_routes import StatusTexts, obey
-from graderd.api.limiter import Closing, Pace, stop_pace
+from graderd.api.http_routes import ConnectionNames, StatusTexts, obey
+from graderd.api.limiter import Closing
 from graderd.api.port import DaemonPort
 from graderd.api.problem import Problem, ProblemError, problem_of_validation
 from graderd.api.settings import ApiLimits
-from graderd.core.commands import AnyCommand, Command, Jog, Preset, Release, Reply, Stop
-from graderd.core.machine import Mode
+from graderd.api.stop import StopLane, is_stop_command
+from graderd.core.commands import AnyCommand, Command, Jog, Preset, Release, Reply
 from graderd.core.status import Status
-from graderd.hal.text import printable
 
 COMMAND: TypeAdapter[Command] = TypeAdapter(AnyCommand)
 MALFORMED_PAUSE_S = 0.1
+TOO_LARGE = 1009
+"""RFC 6455: the connection was closed because of a message too large to be read."""
+TOO_LARGE_REASON = b'{"reason": "a message too large to be read"}'
 UPGRADE_ONLY: dict[int | str, dict[str, Any]] = {
     101: {"description": "the WebSocket is open"},
     426: {"model": Problem, "description": "asked for without a WebSocket upgrade"},
 }
 
 
-def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closing: Closing) -> APIRouter:
-    """The WebSockets over ``port``; ``closing`` ends them."""
+def socket_routes(
+    port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closing: Closing, stops: StopLane
+) -> APIRouter:
+    """The WebSockets over ``port``; ``closing`` ends them, ``stops`` carries out what asks for a stop."""
     router = APIRouter(prefix="/v1")
-    numbers = itertools.count(1)
-    stops = stop_pace(limits)
 
     @router.websocket("/stream")
     async def stream(socket: WebSocket, rate_hz: Annotated[float, Query(gt=0, le=1000)] = limits.stream_max_hz) -> None:
@@ -44,7 +45,7 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
     @router.websocket("/jog")
     async def jog(socket: WebSocket, client: Annotated[str, Query(max_length=60)] = "jog") -> None:
         await socket.accept()
-        session = _JogSession(port, limits, stops, f"{printable(client)}#{next(numbers)}")
+        session = _JogSession(port, limits, stops, ConnectionNames().of(client, socket))
         try:
             await _until_closed(socket, session.run(socket), closing)
         finally:
@@ -84,7 +85,7 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
 class _JogSession:
     """One client's connection: its commands carry a name nobody else has, so its lease is its own."""
 
-    def __init__(self, port: DaemonPort, limits: ApiLimits, stops: Pace, client: str) -> None:
+    def __init__(self, port: DaemonPort, limits: ApiLimits, stops: StopLane, client: str) -> None:
         self._port = port
         self._limits = limits
         self._stops = stops
@@ -96,8 +97,12 @@ class _JogSession:
         while True:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
+                if message.get("code") == TOO_LARGE:
+                    # Never read, it may have been a stop.
+                    await self._stops.carry_out(TOO_LARGE_REASON, self._client)
                 return
-            answer = await self._answer(message.get("text") or message.get("bytes") or b"")
+            text = message.get("text")
+            answer = await self._answer(text.encode("utf-8", "replace") if text else message.get("bytes") or b"")
             await socket.send_text(answer.model_dump_json())
 
     async def release(self) -> None:
@@ -108,7 +113,10 @@ class _JogSession:
             with contextlib.suppress(ProblemError):
                 await obey(self._port, Release(client=self._client), self._limits)
 
-    async def _answer(self, text: str | bytes) -> Reply | Problem:
+    async def _answer(self, text: bytes) -> Reply | Problem:
+        if is_stop_command(text):
+            self._moved = False
+            return await self._stops.carry_out(text, self._client)
         try:
             command = COMMAND.validate_json(text).model_copy(update={"client": self._client})
         except ValidationError as error:
@@ -117,22 +125,13 @@ class _JogSession:
             return problem_of_validation(error.errors(include_input=False, include_url=False))
         if isinstance(command, Jog | Preset):
             self._moved = True
-        if isinstance(command, Stop | Release):
+        if isinstance(command, Release):
             self._moved = False
-        if isinstance(command, Stop):
-            await self._turn_of_stop()
         try:
             reply = await obey(self._port, command, self._limits)
         except ProblemError as error:
             return error.problem
         return reply
-
-    async def _turn_of_stop(self) -> None:
-        """Wait for the turn of one of thousands of stops a second to a machine that the first has stopped. Each is
-        carried out and counted (a reset names the last), and one that finds the machine in any other mode at once."""
-        now_s = asyncio.get_running_loop().time()
-        if not self._stops.take(now_s) and self._port.status().mode is Mode.STOPPED:
-            await asyncio.sleep(self._stops.delay_s(now_s))
 
 
 async def _send_status(socket: WebSocket, port: DaemonPort, texts: StatusTexts, rate_hz: float) -> None:

@@ -30,6 +30,7 @@ class Mode(StrEnum):
 
 
 ARMED = (Mode.MANUAL, Mode.AUTO)
+STANDSTILL = "daemon.loop_blocked"
 
 
 class MachineSettings(Settings):
@@ -169,13 +170,19 @@ def _react(state: State, inputs: Inputs) -> State:
         return state
     if fault is not None and fault.row.reaction >= Reaction.DISARM:
         if state.mode is not Mode.DISARMED or state.arming_since_s is not None:
-            return _disarmed(state, f"{fault.name}: {fault.row.reads}")
+            return _disarmed(state, _own_standstill(inputs) or f"{fault.name}: {fault.row.reads}")
         return state
     if state.mode in ARMED and not inputs.devices_active:
-        return _disarmed(state, "a device left its active state")
+        return _disarmed(state, _own_standstill(inputs) or "a device left its active state")
     if fault is not None and fault.row.reaction is Reaction.RETREAT and state.mode is Mode.AUTO:
         return _manual(state, f"{fault.name}: {fault.row.reads}")
     return state
+
+
+def _own_standstill(inputs: Inputs) -> str:
+    """Why devices seem lost just after the daemon itself stood still; empty where it did not. Their silence is its own
+    deafness: nobody needs to look at their power for that, and a device that is really lost is told afterwards."""
+    return next((f"{f.name}: {f.row.reads}" for f in inputs.faults if f.present and f.name == STANDSTILL), "")
 
 
 def _lapse(state: State, now_s: float) -> State:

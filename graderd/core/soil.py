@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 
@@ -60,8 +60,20 @@ class SoilObservation:
         return {Zone.LEFT: self.share_left, Zone.CENTER: self.share_center, Zone.RIGHT: self.share_right}.get(zone, 0.0)
 
     def as_of(self, now_s: float, max_age_s: float) -> SoilObservation:
-        """The observation as it counts at ``now_s``: UNKNOWN where its picture is older than ``max_age_s`` by now."""
+        """The observation as it counts at ``now_s``: where its picture is older than ``max_age_s`` by now, UNKNOWN, and
+        how much soil lay where is unknown too."""
         age_s = now_s - self.capture_s
-        if age_s <= max_age_s or self.zone is Zone.UNKNOWN:
+        if age_s <= max_age_s:
             return self
-        return replace(self, zone=Zone.UNKNOWN, confidence=0.0, reason=f"the frame is {age_s:.3f} s old by now")
+        return SoilObservation(
+            self.capture_s,
+            Zone.UNKNOWN,
+            0.0,
+            f"the frame is {age_s:.3f} s old by now",
+            blade_angle_deg=self.blade_angle_deg,
+            blade_angle_age_s=self.blade_angle_age_s,
+            frame_number=self.frame_number,
+            method=self.method,
+            cpu_ms=self.cpu_ms,
+            faults=self.faults,
+        )

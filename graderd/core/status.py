@@ -16,7 +16,9 @@ class _Status(BaseModel):
 class AxisStatus(_Status):
     """One axis, in degrees (rotation) or millimetres: requested, limited, sent and measured are all visible.
 
-    ``arrived``: it stands where it was asked to go, within its tolerance."""
+    ``arrived``: it stands where it was asked to go, within its tolerance. What was measured is None once it is older
+    than control would act on; what changes slowly (voltage, temperature, torque, flags), once it is older than 5 s.
+    ``measured_age_s`` goes on telling how old the last position is."""
 
     name: str
     unit: str
@@ -51,7 +53,7 @@ class AttitudeStatus(_Status):
 
 
 class SoilStatus(_Status):
-    """The newest observation of the soil."""
+    """The newest observation of the soil; ``zone`` is unknown, and so is the rest, once its picture is too old."""
 
     zone: Zone = Zone.UNKNOWN
     confidence: float = 0.0

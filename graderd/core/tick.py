@@ -139,9 +139,10 @@ class Tick:
 class Controller:
     """All memory between two ticks. One per machine; :meth:`step` is its only way in."""
 
-    def __init__(self, settings: TickSettings) -> None:
+    def __init__(self, settings: TickSettings, state: State | None = None) -> None:
+        """``state``: where the machine begins, if it is not disarmed."""
         self._settings = settings
-        self._state = State()
+        self._state = state or State()
         self._faults = FaultState()
         self._gate = GateState()
         self._lift = LiftCoordinator(settings.lift_pair, settings.figures)

@@ -128,7 +128,7 @@ async def test_a_dead_rig_is_named_held_and_back_in_standby_when_it_returns(tmp_
         assert (await whole.status()).mode == "disarmed"
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 async def test_a_signal_in_mid_turn_ends_everything_within_two_seconds(tmp_path: Path, number: signal.Signals) -> None:
     async with machine(tmp_path) as whole:
         await whole.turn()

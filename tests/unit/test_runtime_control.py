@@ -19,6 +19,7 @@ from graderd.hal.errors import DeviceRefusedError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.runtime.control import ControlLoop
+from graderd.runtime.control import log as control_log
 from graderd.runtime.state_file import StateFile
 from tests.fakes import FakeMachine
 
@@ -30,9 +31,8 @@ class Bench:
 
     def __init__(self, directory: Path) -> None:
         self.machine = FakeMachine()
-        self.loop = ControlLoop(
-            Config(), self.machine.devices, self.machine.eyes, self.machine.clock, StateFile(str(directory))
-        )
+        self.state_file = StateFile(str(directory))
+        self.loop = ControlLoop(Config(), self.machine.devices, self.machine.eyes, self.machine.clock, self.state_file)
 
     async def ticks(self, count_n: int = 1, zone: Zone | None = None, **shares: Any) -> None:
         """Tick ``count_n`` times; with ``zone``, a new observation of it every third tick."""
@@ -116,6 +116,7 @@ async def test_stop_holds_every_axis_before_it_returns_and_latches(bench: Bench,
     assert all(d.lifecycle is Lifecycle.STANDBY for d in bench.machine.devices.all().values())
     refused = await bench.do(cmd.Arm(client="t"))
     assert not refused.accepted
+    assert bench.state_file.settle()
     last = StateFile(str(tmp_path)).load()
     assert last is not None
     assert last.reason == "test (by t)"
@@ -126,15 +127,60 @@ async def test_an_ordinary_restart_keeps_the_last_stop(bench: Bench, tmp_path: P
     assert (await bench.do(cmd.Reset(client="cab", stop_n=1))).accepted
     assert bench.loop.end("SIGTERM received") is False
     assert bench.loop.tick.state.mode is Mode.STOPPED
+    assert bench.state_file.settle()
     last = StateFile(str(tmp_path)).load()
     assert last is not None
     assert last.reason == "dog on the site (by cab)"
     assert Bench(tmp_path).loop.last_stop == last
 
 
+async def test_after_a_stop_and_a_restart_reset_comes_first(bench: Bench, tmp_path: Path) -> None:
+    await bench.arm()
+    bench.loop.stop_now(cmd.Stop(reason="dog on the site", client="cab"))
+    bench.loop.end("SIGTERM received")
+    assert bench.state_file.settle()
+    again = Bench(tmp_path)
+    await again.ticks(5)
+    assert again.loop.tick.state.mode is Mode.STOPPED
+    assert "dog on the site (by cab)" in again.loop.tick.state.reason
+    refused = await again.do(cmd.Arm(client="t"))
+    assert (refused.accepted, refused.remedy) == (False, "reset first, then arm")
+    assert (await again.do(cmd.Reset(client="t", stop_n=again.loop.tick.state.stop_n))).accepted
+    await again.arm()
+    assert again.state_file.settle()
+    # The reset is remembered too: neither this restart nor one after a clean end needs another.
+    once_more = Bench(tmp_path)
+    assert once_more.loop.tick.state.mode is Mode.DISARMED
+    assert once_more.loop.end("SIGTERM received") is False
+    assert once_more.state_file.settle()
+    assert Bench(tmp_path).loop.tick.state.mode is Mode.DISARMED
+
+
+async def test_after_a_freeze_the_reason_is_the_freeze(bench: Bench) -> None:
+    await bench.arm()
+    bench.machine.clock.advance(1.5)
+    bench.machine.rotation.lose()
+    bench.loop.turn(late_s=1.5)
+    assert bench.loop.tick.state.mode is Mode.DISARMED
+    assert bench.loop.tick.state.reason.startswith("daemon.loop_blocked: ")
+    assert {"daemon.loop_blocked", "rotation.no_reply"} <= {fault.name for fault in bench.loop.tick.faults}
+
+
+async def test_the_wires_come_before_the_log_and_the_state_file(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    await bench.arm()
+    order = bench.machine.log
+    order.clear()
+    monkeypatch.setattr(bench.state_file, "save", lambda reason: order.append(f"state file: {reason}"))
+    monkeypatch.setattr(control_log, "info", lambda *_, **__: order.append("log"))
+    bench.loop.stop_now(cmd.Stop(reason="test"))
+    assert [line for line in order if "hold" not in line] == ["state file: test", "log"]
+    assert order[-2:] == ["state file: test", "log"]
+
+
 async def test_an_end_that_interrupts_work_is_the_last_stop(bench: Bench, tmp_path: Path) -> None:
     await bench.arm()
     assert bench.loop.end("SIGTERM received") is True
+    assert bench.state_file.settle()
     last = StateFile(str(tmp_path)).load()
     assert last is not None
     assert last.reason == "SIGTERM received"

@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
+import select
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +21,7 @@ import pytest
 from graderd.hal.clock import SystemClock
 from graderd.runtime.app import journal
 from graderd.runtime.app.hang_watch import ARM_EVERY_S, HANGS_S, HangWatch
-from graderd.runtime.app.journal import JournalHandler, journal_entry, set_up_logging
+from graderd.runtime.app.journal import LATER_MOST_N, JournalHandler, journal_entry, set_up_logging
 
 FORGED = "person\nPRIORITY=0\n<0>2026-01-01 ERROR forged\x1b[2J"
 
@@ -143,6 +146,7 @@ def test_json_lines_carry_the_fields(capsys: pytest.CaptureFixture[str]) -> None
     logging.getLogger("graderd.x").warning("%s", FORGED, extra={"device": "can", "fault": "can.unplugged"})
     logging.getLogger("graderd.x").warning("%s", FORGED, extra={"device": "can", "fault": "can.unplugged"})
     logging.getLogger("numexpr").info("said by a library")
+    logging.getLogger().handlers[0].close()
     (line,) = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     assert line["message"] == FORGED
     assert (line["level"], line["device"], line["fault"]) == ("warning", "can", "can.unplugged")
@@ -201,3 +205,58 @@ def test_every_logger_of_ours_is_told_at_info() -> None:
     assert logging.getLogger("graderd.drivers.dynamixel.servo_task").isEnabledFor(logging.INFO)
     assert not logging.getLogger("numexpr").isEnabledFor(logging.INFO)
     assert journal.priority(logging.INFO) == 6
+
+
+def test_a_pipe_that_nobody_reads_is_not_waited_for_and_what_was_lost_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    with os.fdopen(reading, "rb", buffering=0) as reader, os.fdopen(writing, "w") as stderr:
+        monkeypatch.setattr(sys, "stderr", stderr)
+        fill(writing)
+        set_up_logging(as_json=False)
+        handler = logging.getLogger().handlers[0]
+        for one in list(handler.filters):
+            handler.removeFilter(one)  # repetitions are held back before they come so far
+        log = logging.getLogger("graderd.test")
+        began_s = time.monotonic()
+        many_n = LATER_MOST_N + 100
+        for number in range(many_n):
+            log.warning("line %d", number)
+        assert time.monotonic() - began_s < 2.0
+        closing = threading.Thread(target=handler.close)
+        text = b""
+        while b"were lost" not in text or not text.endswith(b"\n"):
+            text += reader.read(65536)
+            log.warning("after")
+        told = int(re.search(rb"(\d+) lines of this log were lost", text)[1])  # type: ignore[index]  # or it fails
+        assert many_n - LATER_MOST_N - 2 <= told <= many_n - LATER_MOST_N
+        os.set_blocking(reading, False)
+        closing.start()
+        while closing.is_alive():
+            select.select([reader], [], [], 0.01)
+            reader.read(65536)
+        closing.join()
+    logging.getLogger().handlers.clear()
+
+
+def test_a_process_whose_standard_error_nobody_reads_ends(tmp_path: Path) -> None:
+    del tmp_path
+    code = (
+        "import logging, os\nfrom graderd.runtime.app.journal import set_up_logging\n"
+        "os.set_blocking(2, False)\n"
+        "try:\n    while True: os.write(2, b'x' * 4096)\nexcept BlockingIOError: pass\n"
+        "os.set_blocking(2, True)\nset_up_logging(False)\nlogging.getLogger('graderd').error('one')\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE)
+    assert process.wait(20) == 0
+    assert process.stderr is not None
+    process.stderr.close()
+
+
+def fill(descriptor: int) -> None:
+    """Write until the pipe is full."""
+    os.set_blocking(descriptor, False)
+    try:
+        while True:
+            os.write(descriptor, b"x" * 4096)
+    except BlockingIOError:
+        os.set_blocking(descriptor, True)
