@@ -20,7 +20,7 @@ PYTHON_TARGETS ?= run test
 FIND_PYTHON = PYENV_VERSION=$* $(BIN)/uv python find --system --no-python-downloads
 SOAK_S ?= 900
 
-.PHONY: help run test quick test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean
+.PHONY: help run test quick passes test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
@@ -79,6 +79,9 @@ test-python-%: $(STAMP)
 	@python=$$($(FIND_PYTHON) $* 2>/dev/null || { $(BIN)/uv python install --quiet $* >&2 && $(FIND_PYTHON) $*; }) \
 	|| { echo "test-pythons: no Python $* on this machine, nor can uv download one; install it, or PYTHONS=\"...\" for the others" >&2; exit 1; }; \
 	$(MAKE) --no-print-directory VENV=.venv-$* PYTHON=$$python $(PYTHON_TARGETS)
+
+passes: $(STAMP) ## whole passes on rig and daemon, 144 of them, more than an hour (ARGS="--sample 20", ARGS=--loop)
+	@$(BIN)/python -m benchmarks.passes $(ARGS)
 
 faults: $(STAMP) ## inject every fault in every phase of work (ARGS="--short --json" for a part of it)
 	@$(BIN)/python -m harness.campaign $(ARGS)

@@ -31,6 +31,7 @@ from graderd.hal.settings import (
     Positive,
     Settings,
     StopInputSettings,
+    VehicleSettings,
     tag_of,
 )
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
@@ -181,6 +182,7 @@ class Config(Settings):
     recording: RecordingSettings = Field(default_factory=RecordingSettings)
     state: StateSettings = Field(default_factory=StateSettings)
     stop_input: AnyStopInputSettings = Field(default_factory=StopInputSettings)
+    vehicle: VehicleSettings = Field(default_factory=VehicleSettings)
     presets: dict[str, Preset] = Field(default_factory=_presets)
 
     @model_validator(mode="after")

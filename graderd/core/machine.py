@@ -15,7 +15,7 @@ from pydantic import Field
 from graderd.core import commands as cmd
 from graderd.core.axes import PARTS, Goals, Pose
 from graderd.core.faults.monitor import ActiveFault, Reaction, held_axes, worst
-from graderd.core.rule import Decision, RuleSettings, decide
+from graderd.core.rule import Decision, RuleSettings, Travel, decide
 from graderd.core.soil import SoilObservation
 from graderd.hal.settings import Positive, Settings
 
@@ -88,7 +88,8 @@ class State:
 class Inputs:
     """What is known at one tick.
 
-    ``observation``: a new one, not handed in before. ``settled``: every commanded axis is at its goal, or at the bound
+    ``observation``: a new one, not handed in before. ``travel``: how the machine drives, None where it does not say.
+    ``settled``: every commanded axis is at its goal, or at the bound
     the gate lets it have; ``arrived``: at its goal. ``held``: why an axis with a goal was not let move, by axis.
     All three speak of the goals of the tick before.
     ``devices_active``: all required devices are ACTIVE. ``arm_error``: why arming the devices failed, once.
@@ -99,6 +100,7 @@ class Inputs:
     resolve: Callable[[cmd.Jog | cmd.Preset, Pose], tuple[Goals, ...] | str]
     commands: tuple[cmd.Command, ...] = ()
     observation: SoilObservation | None = None
+    travel: Travel | None = None
     pose: Pose = field(default_factory=Pose)
     settled: bool = True
     arrived: bool = True
@@ -318,7 +320,7 @@ def _advance(state: State, inputs: Inputs, settings: MachineSettings, rule: Rule
         decision = (
             Decision()
             if "rotation" in held
-            else decide(state.decision, inputs.observation, inputs.settled, inputs.now_s, rule)
+            else decide(state.decision, inputs.observation, inputs.settled, inputs.now_s, rule, inputs.travel)
         )
         state = replace(state, decision=decision, goals=Goals(rotation_deg=decision.angle_deg))
     if state.mode in ARMED:

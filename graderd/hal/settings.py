@@ -303,6 +303,19 @@ AnyStopInputSettings = Annotated[
 ]
 
 
+class VehicleSettings(Settings):
+    """Where the machine's speed comes from. Without it a decision is kept by time instead of travel."""
+
+    source: Literal["none", "j1939", "simulated"] = Field(
+        "none", description="j1939: wheel-based speed (PGN 65265, SPN 84) on the bus of the actuators"
+    )
+    address_n: int | None = Field(
+        None, ge=0, le=253, description="j1939: believe this address alone; none: whichever sends it, one at a time"
+    )
+    path: str = Field("", description="simulated: the rig's control socket")
+    max_age_s: Positive = Field(0.5, description="an older speed counts as unknown; J1939 sends it every 0.1 s")
+
+
 class CameraSettings(Settings):
     """Where pictures come from and how the camera is set."""
 

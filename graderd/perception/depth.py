@@ -15,12 +15,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from graderd.core.blade import BladeGeometry
+from graderd.core.blade import STEEPEST_MEETING_DEG, BladeGeometry
+from graderd.core.soil import Zone
 from graderd.hal.camera import DepthImage
 from graderd.perception.decide import Verdict, decide
 from graderd.perception.geometry import F32, F64, U8, View, third_outlines_px
 from graderd.perception.registration import SUNK_M, BladeFinder, BladeFix, Ground, GroundFit
 from graderd.perception.settings import DecisionSettings, DepthSettings
+from graderd.perception.split import Cells, split_soil
 
 I64 = npt.NDArray[np.intp]
 Bools = npt.NDArray[np.bool_]
@@ -29,6 +31,9 @@ NOMINAL_WIDTH_PX = 848
 KEPT_GRIDS_N = 64
 CONTEXT_M = 0.14
 """The height map goes on so far beyond the reach: what stands at its border is judged by what stands before it."""
+BESIDE_RATIO = 0.87
+"""And beyond both ends of the blade by this part of the travel looked ahead: the sine of 60 degrees, as far as a blade
+turns; one turned further looks less far ahead at its leading end."""
 STEEP_TOLERANCE_M = 0.02
 UNSEEN = 10.0
 """Stands for a height that is not known, metres."""
@@ -41,16 +46,21 @@ class HeightMap:
     """Soil in blade coordinates: ``height_m[i, j]`` at s cell i (right to left) and d cell j (blade to front).
 
     ``seen`` is False where the height was filled in. ``valid``: per third (right, center, left) the share of the pixels
-    on it that measure it, neither without depth nor hidden by something nearer.
+    on it that measure it, neither without depth nor hidden by something nearer. ``volumes_l``: all soil before each
+    third to the reach; ``carried_l``, ``ahead_l``: see :func:`graderd.perception.split.split_soil`. ``angle_deg``:
+    where the blade was found.
     """
 
     height_m: F64
     seen: Bools
     threshold_m: float
     volumes_l: tuple[float, float, float]
+    carried_l: tuple[float, float, float]
+    ahead_l: tuple[float, float, float]
     valid: tuple[float, float, float]
     ground: Ground
     blade: BladeFix
+    angle_deg: float
 
 
 class DepthJudge:
@@ -75,6 +85,14 @@ class DepthJudge:
         self._cell_s_m = blade.length_m / self._along_n
         self._cell_d_m = blade.reach_m / self._ahead_n
         self._context_n = round(CONTEXT_M / self._cell_d_m)
+        self._travel_m = blade.reach_m + CONTEXT_M
+        self._beside_n = int(np.ceil(self._travel_m * BESIDE_RATIO / self._cell_s_m))
+        rows_n, columns_n = self._along_n + 2 * self._beside_n, self._ahead_n + self._context_n
+        self._cells = Cells(
+            self._cell_s_m * np.arange(0.5 - rows_n / 2, rows_n / 2, dtype=np.float64),
+            self._cell_d_m * np.arange(0.5, columns_n, dtype=np.float64),
+            self._cell_s_m * self._cell_d_m,
+        )
 
     def height_map(self, depth_mm: DepthImage, angle_deg: float) -> HeightMap:
         """Measure one depth picture (uint16, mm along the optical axis, 0 = no value)."""
@@ -96,12 +114,25 @@ class DepthJudge:
         ahead, along = np.float32(fix.ahead_m), np.float32(fix.along_m)
         d = np.asarray(d - ahead + turn * s, dtype=np.float32)
         s = np.asarray(s - along - turn * d, dtype=np.float32)
-        return self._map(s, d, z, setback, ground, fix, valid)
+        return self._map(s, d, z, setback, ground, fix, valid, angle_deg + fix.turn_deg)
 
     def verdict(self, soil: HeightMap) -> Verdict:
         """Judge a height map."""
+        return self._believed(soil, soil.volumes_l)
+
+    def verdict_ahead(self, soil: HeightMap) -> Verdict:
+        """Judge what the blade will meet."""
+        verdict = self._believed(soil, soil.ahead_l)
+        ahead_l, carried_l = sum(soil.ahead_l), sum(soil.carried_l)
+        if verdict.zone is not Zone.NONE and ahead_l * 100 < self._settings.ahead_min_percent * carried_l:
+            return verdict.unknown(f"{ahead_l:.1f} l ahead do not stand out of the {carried_l:.1f} l that are carried")
+        if abs(soil.angle_deg) > STEEPEST_MEETING_DEG:
+            return verdict.unknown(f"the blade is turned by {soil.angle_deg:.0f} degrees: it meets hardly anything")
+        return verdict
+
+    def _believed(self, soil: HeightMap, amounts_l: tuple[float, float, float]) -> Verdict:
         settings = self._settings
-        verdict = decide(soil.volumes_l, settings.none_volume_l, "l", self._decision, soil.volumes_l)
+        verdict = decide(amounts_l, settings.none_volume_l, "l", self._decision, amounts_l)
         weakest = min(soil.valid)
         if weakest * 100 < settings.min_valid_percent:
             return verdict.unknown(
@@ -152,40 +183,54 @@ class DepthJudge:
         return grid.ravel(), tuple(int(n) for n in np.bincount(grid.ravel(), minlength=4))
 
     def _map(
-        self, s: F32, d: F32, z: F32, setback: F32, ground: Ground, fix: BladeFix, valid: tuple[float, float, float]
+        self,
+        s: F32,
+        d: F32,
+        z: F32,
+        setback: F32,
+        ground: Ground,
+        fix: BladeFix,
+        valid: tuple[float, float, float],
+        angle_deg: float,
     ) -> HeightMap:
         blade, settings = self._blade, self._settings
-        half = np.float32(blade.length_m / 2)
+        along_n = self._cells.s_m.size
+        half = np.float32(along_n * self._cell_s_m / 2)
         front = d > np.maximum(np.float32(FACE_MARGIN_M) - setback, np.float32(0.0))
         inside = np.flatnonzero(front & (np.abs(s) < half))
         s, d, z = s[inside], d[inside], z[inside]
         ahead_n = self._ahead_n + self._context_n
-        i = np.minimum(((s + half) * np.float32(1 / self._cell_s_m)).astype(np.int32), self._along_n - 1)
+        i = np.minimum(((s + half) * np.float32(1 / self._cell_s_m)).astype(np.int32), along_n - 1)
         j = np.minimum((d * np.float32(1 / self._cell_d_m)).astype(np.int32), ahead_n - 1)
         flat = i * ahead_n + j
-        size = self._along_n * ahead_n
+        size = along_n * ahead_n
         count = np.bincount(flat, minlength=size)
         total = np.bincount(flat, weights=z, minlength=size)
-        seen = (count > 0).reshape(self._along_n, ahead_n)
+        seen = (count > 0).reshape(along_n, ahead_n)
         height = np.divide(total, count, out=np.zeros(size), where=count > 0).reshape(seen.shape)
         slope = np.tan(np.radians((settings.steepest_deg, settings.repose_deg))) * self._cell_d_m
         seen = without_steep(height, seen, float(slope[0]))
-        filled = fill_hidden(height, seen, float(slope[1]), float(slope[0]))[:, : self._ahead_n]
-        seen = seen[:, : self._ahead_n]
+        filled = fill_hidden(height, seen, float(slope[1]), float(slope[0]))
         distance = 0.9
         expected = settings.disparity_noise_px * distance**2 / (self._focal_px * settings.baseline_m)
         noise = max(expected, ground.residual_m)
         threshold = max(settings.min_height_m, settings.noise_factor_ratio * noise / 2.0)
         soil = np.where(filled > threshold, filled, 0.0)
-        litres = soil.reshape(3, -1).sum(axis=1) * self._cell_s_m * self._cell_d_m * 1000.0
+        meeting_deg = min(max(angle_deg, -STEEPEST_MEETING_DEG), STEEPEST_MEETING_DEG)
+        carried_l, ahead_l = split_soil(soil, self._cells, meeting_deg, blade, settings.repose_deg, self._travel_m)
+        before = slice(self._beside_n, along_n - self._beside_n), slice(self._ahead_n)
+        litres = soil[before].reshape(3, -1).sum(axis=1) * self._cells.area_m2 * 1000.0
         return HeightMap(
-            filled,
-            seen,
+            filled[before],
+            seen[before],
             threshold,
             (float(litres[0]), float(litres[1]), float(litres[2])),
+            carried_l,
+            ahead_l,
             valid,
             ground,
             fix,
+            angle_deg,
         )
 
 

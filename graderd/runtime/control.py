@@ -17,6 +17,7 @@ from graderd.core.tick import AxisSensed, AxisTick, Controller, Sensed, Tick, Ti
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceError
 from graderd.hal.fault import DeviceFault
+from graderd.hal.vehicle import VehicleTelemetry
 from graderd.runtime.devices import Devices, PowerSequencer
 from graderd.runtime.state_file import LastStop, StateFile
 
@@ -57,6 +58,7 @@ def tick_settings(config: Config) -> TickSettings:
         presets=config.presets,
         overrun_s=config.control.overrun_s,
         max_frame_age_s=config.perception.decision.max_frame_age_s,
+        max_vehicle_age_s=config.vehicle.max_age_s,
     )
 
 
@@ -202,6 +204,7 @@ class ControlLoop:
             arm_error=self._power.take_error(),
             refused=refused,
             late_s=late_s,
+            vehicle=self._devices.vehicle.telemetry() if self._devices.vehicle else VehicleTelemetry(),
         )
 
     def _act(self, tick: Tick) -> None:

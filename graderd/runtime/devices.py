@@ -17,6 +17,7 @@ from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.rotator import Rotator
 from graderd.hal.service import DeviceService
+from graderd.hal.vehicle import Vehicle
 
 RETRY_S = 1.0
 
@@ -54,7 +55,7 @@ def _watch_nothing(listener: Callable[[str], None]) -> Callable[[], None]:  # no
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """Everything that can move, and the bus under it."""
+    """Everything that can move, the bus under it, and the vehicle that carries it."""
 
     rotation: Rotator
     link: Link
@@ -66,6 +67,7 @@ class Devices:
     watch_bus: Callable[[Callable[[str], None]], Callable[[], None]] = _watch_nothing
     """Calls a listener with every frame on the bus, received or sent, as a line of candump text; returns the call
     that ends it."""
+    vehicle: Vehicle | None = None
     problems: dict[str, str] = field(default_factory=dict)
     """Why a device, or the bus (``can``), is not open yet; kept by :func:`open_devices`."""
 
@@ -164,6 +166,8 @@ async def open_devices(devices: Devices) -> None:
     async with asyncio.TaskGroup() as group:
         group.create_task(_keep_trying("rotation", devices.rotation.open, devices.problems), name="open-rotation")
         group.create_task(_open_bus(devices), name="open-can")
+        if devices.vehicle is not None:
+            group.create_task(devices.vehicle.open(), name="open-vehicle")
 
 
 async def _open_bus(devices: Devices) -> None:

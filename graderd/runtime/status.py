@@ -8,8 +8,9 @@ from typing import Any, Protocol, TypeVar
 
 from graderd.config import Config
 from graderd.core.axes import UNITS
-from graderd.core.soil import SoilObservation
+from graderd.core.soil import SoilAhead, SoilObservation, Thirds
 from graderd.core.status import (
+    AheadStatus,
     AttitudeStatus,
     AxisStatus,
     DecisionStatus,
@@ -18,16 +19,21 @@ from graderd.core.status import (
     RequirementStatus,
     SoilStatus,
     Status,
+    ThirdsStatus,
     TickStatus,
+    VehicleStatus,
 )
 from graderd.core.tick import AxisSensed, AxisTick
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry
+from graderd.hal.vehicle import VehicleTelemetry
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 
 T = TypeVar("T")
+VEHICLE_MAX_AGE_S = 1.0
+"""How the machine drives is unknown when nobody has told it for so long."""
 VERSION = version("graderd")
 KNOWN_FOR_S = 5.0
 
@@ -54,8 +60,11 @@ def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) 
             zone=decision.zone,
             angle_deg=decision.angle_deg,
             age_s=now_s - decision.decided_s if decision.zone is not None else None,
-            reason=decision.reason,
+            kept=decision.kept,
+            since_m=decision.since_m,
+            reason=decision.reason(now_s),
         ),
+        vehicle=_vehicle(sensed.vehicle, now_s),
         axes={
             name: _axis(name, told, tick.axes[name], now_s, figures[name].max_age_s)
             for name, told in sensed.axes.items()
@@ -107,11 +116,33 @@ def _soil(newest: SoilObservation | None, frames_per_s: float, now_s: float) -> 
         volume_left_l=newest.volume_left_l,
         volume_center_l=newest.volume_center_l,
         volume_right_l=newest.volume_right_l,
+        ahead=newest.ahead and _ahead(newest.ahead),
+        carried=newest.carried and ThirdsStatus(**_litres(newest.carried)),
         blade_angle_deg=newest.blade_angle_deg,
         frame_number_n=newest.frame_number,
         frames_per_s=frames_per_s,
         method=newest.method,
     )
+
+
+def _ahead(ahead: SoilAhead) -> AheadStatus:
+    return AheadStatus(zone=ahead.zone, confidence=ahead.confidence, reason=ahead.reason, **_litres(ahead.litres))
+
+
+def _litres(thirds: Thirds) -> dict[str, float]:
+    return {"left_l": thirds.left, "center_l": thirds.center, "right_l": thirds.right}
+
+
+def _vehicle(told: VehicleTelemetry, now_s: float) -> VehicleStatus:
+    return VehicleStatus(
+        speed_m_per_s=_moving(told.speed_m_per_s, now_s),
+        travelled_m=_moving(told.travelled_m, now_s),
+        age_s=told.speed_m_per_s.age_s(now_s) if told.speed_m_per_s else None,
+    )
+
+
+def _moving(reading: Reading[float] | None, now_s: float) -> float | None:
+    return reading.value if reading is not None and reading.is_fresh(now_s, VEHICLE_MAX_AGE_S) else None
 
 
 def _axis(name: str, axis: AxisSensed, decided: AxisTick, now_s: float, max_age_s: float) -> AxisStatus:

@@ -229,6 +229,8 @@ class Daemon:
             async with asyncio.timeout(self._config.control.shutdown_timeout_s):
                 for part in order:
                     await self._close_part(part)
+                if self._devices.vehicle is not None:
+                    await self._devices.vehicle.close()
                 await self._devices.link.close()
         except TimeoutError:
             log.error("devices did not close within %.1f s", self._config.control.shutdown_timeout_s)
