@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
+from collections.abc import Callable
 
-from graderd.drivers.dynamixel.bus import BusLog, ServoBus
+from graderd.drivers.dynamixel.bus import BusTap, ServoBus
 from graderd.drivers.dynamixel.device import Ph54Device
 from graderd.drivers.dynamixel.serial_port import ListPorts, find_port
 from graderd.drivers.dynamixel.table import ControlTable
@@ -36,7 +37,6 @@ class ServoLink:
         table: ControlTable,
         expected_mode: int,
         clock: Clock,
-        bus_log: BusLog | None,
         list_ports: ListPorts,
     ) -> None:
         self.firmware_version: int | None = None
@@ -48,7 +48,7 @@ class ServoLink:
         self._table = table
         self._mode = expected_mode
         self._clock = clock
-        self._bus_log = bus_log
+        self._taps: list[BusTap] = []
         self._list_ports = list_ports
         self._device: Ph54Device | None = None
 
@@ -56,6 +56,11 @@ class ServoLink:
     def is_up(self) -> bool:
         """Whether a servo was identified and its port has not been lost since."""
         return self._device is not None and self.bus is not None and self.bus.is_open
+
+    def tap(self, listener: BusTap) -> Callable[[], None]:
+        """Call ``listener`` with all bytes on the wire, over all connections; returns the call that ends it."""
+        self._taps.append(listener)
+        return lambda: self._taps.remove(listener)
 
     @property
     def device(self) -> Ph54Device:
@@ -81,7 +86,7 @@ class ServoLink:
             cause = f"{self._table.title} cannot run at {s.baud_n} bit/s"
             raise DeviceRefusedError("rotation", cause, f"Choose one of {rates}")
         port = find_port(s.port, s.usb_serial_number, self._list_ports)
-        self.bus = ServoBus(port, s.baud_n, clock=self._clock, bus_log=self._bus_log)
+        self.bus = ServoBus(port, s.baud_n, clock=self._clock, taps=self._taps)
         self.bus.open()
         self.slow_adapter = self._judge_adapter(self.bus)
         device = Ph54Device(self.bus, self._table, s.servo_id_n)

@@ -17,3 +17,8 @@ class DeviceService:
 
     run: Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
     only_reads: bool = False
+
+
+WatchBus = Callable[[Callable[[str], None]], Callable[[], None]]
+"""Calls a listener with everything on a wire from now on, received or sent, each a line of text; returns the call that
+ends it. Nobody listening costs nothing."""

@@ -147,7 +147,7 @@ async def test_paths_and_methods_that_do_not_exist(tmp_path: Path) -> None:
         assert (await client.get("/nothing")).status_code == 404
         assert (await client.get("/nothing")).json()["where"] == "/nothing"
         assert (await client.delete("/v1/status")).status_code == 405
-        for stream in ("/v1/stream", "/v1/jog", "/v1/can"):
+        for stream in ("/v1/stream", "/v1/jog", "/v1/bus/can"):
             answer = await client.get(stream)
             assert answer.status_code == 426
             assert "WebSocket" in answer.json()["error"]
@@ -262,7 +262,7 @@ async def test_the_description_is_complete(tmp_path: Path) -> None:
         "/v1/services/{name}",
         "/v1/stream",
         "/v1/jog",
-        "/v1/can",
+        "/v1/bus/{name}",
     }
     for operations in paths.values():
         for operation in operations.values():

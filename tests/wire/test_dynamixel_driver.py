@@ -48,7 +48,8 @@ async def tapped(tmp_path: Path, servo: VirtualServo, **changes: float) -> tuple
     wire = VirtualServoBus([servo], tmp_path / "servo", clock=clock)
     await wire.start()
     tap = Tap()
-    rotator = Ph54Rotator(Ph54Settings(**{"port": str(tmp_path / "servo"), **changes}), clock=clock, bus_log=tap)
+    rotator = Ph54Rotator(Ph54Settings(**{"port": str(tmp_path / "servo"), **changes}), clock=clock)
+    rotator.tap(tap)
     await rotator.open()
     return tap, rotator, wire
 
