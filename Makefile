@@ -127,6 +127,9 @@ mutants: $(STAMP) ## mutate gate, state machine and fault monitor; list what the
 	@$(BIN)/python -m mutmut run $(ARGS)
 	@$(BIN)/python -m mutmut results
 
+mutants-wide: $(STAMP) ## seed thirty mistakes in runtime, drivers and interface; each must be noticed by its nearest tests
+	@$(BIN)/python -m harness.mutants_wide $(ARGS)
+
 core-coverage: $(STAMP) ## branch coverage of gate, state machine and fault monitor by their own tests (must be 100 %)
 	@$(BIN)/python -m pytest -q -n 2 --cov=graderd.core.gate --cov=graderd.core.machine --cov=graderd.core.faults --cov-branch --cov-fail-under=100 --cov-report=term-missing tests/unit/test_core_gate.py tests/unit/test_core_machine.py tests/unit/test_core_machine_model.py tests/unit/test_core_golden.py tests/unit/test_fault_catalogue.py
 

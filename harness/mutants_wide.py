@@ -106,7 +106,7 @@ RUNTIME: Final = (
         "graderd/runtime/perception_supervisor.py",
         "return self._newest.as_of(now_s, self._start.perception.decision.max_frame_age_s)",
         "return self._newest",
-        ("tests/unit/test_perception_ages.py::test_an_old_frame_decides_nothing_and_a_stale_one_is_none",),
+        ("tests/fault/test_perception_supervisor.py::test_a_frame_that_has_grown_old_decides_nothing",),
         "the blade turns to what a frame of half a second ago showed",
     ),
     Mutant(
@@ -126,12 +126,12 @@ RUNTIME: Final = (
         "after a crash the guard stops the wires of a file changed meanwhile, not those that move",
     ),
     Mutant(
-        "maneuver-stays-armed",
+        "maneuver-after-stop",
         "graderd/runtime/maneuver.py",
-        "        await self._loop.command(cmd.Disarm(client=CLIENT))\n",
-        "        if error is None:\n            await self._loop.command(cmd.Disarm(client=CLIENT))\n",
-        ("tests/unit/test_runtime_maneuver.py",),
-        "a maneuver that fails leaves the machine armed",
+        "        if state.mode is not Mode.MANUAL:\n            raise DeviceLostError",
+        "        if state.mode is Mode.DISARMED:\n            raise DeviceLostError",
+        ("tests/unit/test_runtime_maneuver.py::test_stop_ends_it_under_way",),
+        "a maneuver goes on asking for motion after a stop, and reports a result",
     ),
 )
 
@@ -169,11 +169,11 @@ DRIVERS: Final = (
         "an overload that nobody commanded is retried instead of latched",
     ),
     Mutant(
-        "no-veto-time",
+        "short-veto-time",
         "drivers/j1939/claim.py",
-        "needs_veto = 128 <= self.wanted <= 247",
-        "needs_veto = 128 < self.wanted < 247",
-        ("tests/unit/test_j1939_claim.py::test_self_configurable_addresses_wait_for_a_veto",),
+        "VETO_S: Final = 0.25\n",
+        "VETO_S: Final = 0.025\n",
+        ("tests/unit/test_j1939_claim.py::test_it_asks_who_is_there_then_claims_and_waits_250_ms",),
         "graderd sends from an address that another node may hold",
     ),
     Mutant(
@@ -197,7 +197,7 @@ DRIVERS: Final = (
         "drivers/dynamixel/servo_task.py",
         "now_s - self._goal_s > self._settings.goal_timeout_s",
         "now_s - self._goal_s > 100.0 * self._settings.goal_timeout_s",
-        ("tests/unit/test_dynamixel_commands.py::test_a_goal_that_is_not_renewed_expires_at_its_time",),
+        ("tests/contract/test_dynamixel_rotator.py::TestPh54OverFourTransports::test_a_goal_not_renewed_is_counted",),
         "the blade goes on to the goal of a control loop that is dead",
     ),
     Mutant(
@@ -209,12 +209,12 @@ DRIVERS: Final = (
         "a killed daemon's blade stands later than the configured time",
     ),
     Mutant(
-        "strangers-torque",
-        "drivers/dynamixel/servo_task.py",
-        'if self.torque_is_ours and observer.torque_on and self._settings.torque_at_disarm == "off":',
-        'if observer.torque_on and self._settings.torque_at_disarm == "off":',
-        ("tests/fault/test_dynamixel_presence.py::test_torque_that_another_switched_on_is_left_alone",),
-        "opening the port lets go of a blade that something else holds up",
+        "arms-in-motion",
+        "drivers/dynamixel/arming.py",
+        "    if abs(speed) > _STILL_DEG_PER_S:\n",
+        "    if speed > 20.0 * _STILL_DEG_PER_S:\n",
+        ("tests/fault/test_dynamixel_presence.py::test_arming_is_refused_outside_the_limits_and_in_motion",),
+        "a blade that somebody is turning by hand gets its torque",
     ),
     Mutant(
         "endless-back-off",
@@ -226,11 +226,13 @@ DRIVERS: Final = (
     ),
     Mutant(
         "safe-off-once",
-        "drivers/dynamixel/safe_off.py",
-        "_ATTEMPTS_N = 3\n",
-        "_ATTEMPTS_N = 1\n",
-        ("tests/fault/test_dynamixel_exit.py::test_safe_off_tries_three_times_on_a_line_that_loses_packets",),
-        "one lost packet leaves the torque on after the daemon died",
+        "drivers/electrak/safe_off.py",
+        "REPEATS_N: Final = 4\n",
+        "REPEATS_N: Final = 1\n",
+        (
+            "tests/unit/test_electrak_parts.py::test_the_last_words_are_said_again_to_whom_a_full_queue_kept_from_hearing",
+        ),
+        "after a crash one full queue leaves an actuator on its way",
     ),
 )
 

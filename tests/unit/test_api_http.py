@@ -279,6 +279,22 @@ async def test_the_description_is_complete(tmp_path: Path) -> None:
     assert {"Status", "Reply", "Problem", "AxisStatus", "FaultStatus"} <= schemas
 
 
+async def test_the_oldest_connection_makes_room_for_a_new_one(tmp_path: Path) -> None:
+    """Whoever wants to stop the machine gets in, however many connections hang about."""
+    async with serving(tmp_path, limits=ApiLimits(connections_max_n=4)) as (daemon, path):
+        idle = [await asyncio.open_unix_connection(str(path)) for _ in range(4)]
+        async with client_of(path) as client:
+            assert (await client.post("/v1/stop")).status_code == 200
+        assert daemon.status().mode is Mode.STOPPED
+        with contextlib.suppress(ConnectionResetError):
+            assert await within(5, idle[0][0].read()) == b""
+        assert not idle[1][0].at_eof()
+        for _, writer in idle:
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+
+
 async def test_requests_that_wait_when_the_daemon_ends_are_answered(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

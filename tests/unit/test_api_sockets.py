@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from graderd.api.settings import ApiLimits
 from graderd.client import AsyncClient, RefusedError
 from graderd.core import commands as cmd
-from graderd.core.machine import Mode
+from graderd.core.machine import MachineSettings, Mode
 from graderd.core.status import Status
 from harness.api_daemon import FakeDaemon, serving, within
 
@@ -120,6 +120,17 @@ async def test_the_lease_is_given_back_when_the_client_goes(tmp_path: Path, how:
         await daemon.until(lambda: daemon.state.lease is None, timeout_s=1.0)
         assert daemon.state.reason == "released"
         assert daemon.positions["rotation"] < 30.0
+
+
+async def test_the_lease_of_a_preset_is_given_back_when_the_client_goes(tmp_path: Path) -> None:
+    async with serving(tmp_path, FakeDaemon(settings=MachineSettings(lease_s=60.0))) as (daemon, path):
+        await armed(daemon)
+        socket = await connect(path, "/v1/jog")
+        assert (await ask(socket, command="preset", name="transport"))["accepted"]
+        assert daemon.state.lease is not None
+        await socket.close()
+        await daemon.until(lambda: daemon.state.lease is None, timeout_s=5.0)
+        assert daemon.state.reason == "released"
 
 
 async def test_nobody_keeps_somebody_elses_lease(tmp_path: Path) -> None:

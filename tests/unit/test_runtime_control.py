@@ -266,6 +266,26 @@ async def test_commands_of_one_tick_get_their_own_replies_with_stop_first(bench:
     assert not (await auto).accepted
 
 
+async def test_what_was_asked_before_a_stop_is_void(bench: Bench) -> None:
+    """A reset or a jog that was under way when somebody pressed stop must not undo it."""
+    await bench.arm()
+    asked = [cmd.Jog(axis="rotate", value=5.0, client="t"), cmd.Reset(client="t"), cmd.Arm(client="t")]
+    tasks = [asyncio.create_task(bench.loop.command(command)) for command in asked]
+    await asyncio.sleep(0)
+    assert bench.loop.stop_now(cmd.Stop(reason="person near", client="u")).accepted
+    await bench.ticks(2)
+    replies = [await task for task in tasks]
+    assert [(reply.accepted, reply.message) for reply in replies] == [(False, "a stop came first")] * 3
+    assert bench.loop.tick.state.mode is Mode.STOPPED
+
+
+async def test_a_device_that_is_active_while_it_should_not_be_is_disarmed(bench: Bench) -> None:
+    await bench.ticks(2)
+    bench.machine.tilt.lifecycle = Lifecycle.ACTIVE
+    await bench.ticks(2)
+    assert bench.machine.tilt.lifecycle is Lifecycle.STANDBY
+
+
 async def test_a_flood_of_commands_is_worked_off_in_portions(bench: Bench) -> None:
     tasks = [asyncio.create_task(bench.loop.command(cmd.Renew(client=f"c{n}"))) for n in range(100)]
     await asyncio.sleep(0)
