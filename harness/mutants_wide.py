@@ -29,6 +29,8 @@ TIMEOUT_S: Final = 600.0
 """The slowest of the tests takes some seconds; a change may make one wait for ever, which is noticed too."""
 ONE_FAILED: Final = 1
 """pytest's exit status where tests ran and at least one failed."""
+TOO_LONG: Final = 124
+"""As timeout(1) says it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +84,8 @@ RUNTIME: Final = (
         "graderd/runtime/control.py",
         "            self._refused[axis] = str(error)\n            self._devices.all()[axis].hold()\n",
         "            self._refused[axis] = str(error)\n",
-        (CONTROL + "test_a_driver_that_refuses_a_goal_makes_the_axis_hold_and_says_why",),
-        "an axis whose driver refuses a goal goes on to the former one",
+        (CONTROL + "test_a_refused_goal_ends_the_former_one_in_the_same_tick",),
+        "an axis whose driver refuses a goal goes on to the former one for a tick",
     ),
     Mutant(
         "unbounded-tick",
@@ -342,14 +344,14 @@ def copy_tree(target: Path, root: Path = ROOT) -> None:
     listed = subprocess.run(command, capture_output=True, check=True).stdout.decode().split("\0")
     for name in filter(None, listed):
         source, to = root / name, target / name
-        if not source.exists(follow_symlinks=False) if sys.version_info >= (3, 12) else not os.path.lexists(source):
-            continue
+        if not os.path.lexists(source):
+            continue  # taken away, and git not told yet
         to.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(source, to, follow_symlinks=False)
 
 
 def run_tests(tree: Path, tests: Sequence[str], *, first_only: bool) -> tuple[int, list[str], str]:
-    """pytest's exit status (None of its own: 124, it took too long), the tests that failed, and the end of its text."""
+    """pytest's exit status (:data:`TOO_LONG` where it was ended), the tests that failed, and the end of its text."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:randomly", *tests]
     if first_only:
         command.insert(4, "-x")
@@ -359,7 +361,7 @@ def run_tests(tree: Path, tests: Sequence[str], *, first_only: bool) -> tuple[in
             command, cwd=tree, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
         )
     except subprocess.TimeoutExpired:
-        return 124, [], f"not done within {TIMEOUT_S:g} s"
+        return TOO_LONG, [], f"not done within {TIMEOUT_S:g} s"
     failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
     return done.returncode, failed, (done.stdout + done.stderr)[-2000:]
 
@@ -386,7 +388,7 @@ def try_mutant(tree: Path, mutant: Mutant) -> Result:
     seconds = time.monotonic() - started_s
     if status == 0:
         return Result(mutant, "survived", "", seconds)
-    if status == 124:
+    if status == TOO_LONG:
         return Result(mutant, "killed", said, seconds)
     if status == ONE_FAILED and failed:
         return Result(mutant, "killed", failed[0].rpartition("::")[2], seconds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 
 import pytest
 from hypothesis import given
@@ -159,8 +160,8 @@ class SlowPort:
 
 def test_the_last_words_are_said_again_to_whom_a_full_queue_kept_from_hearing(monkeypatch: pytest.MonkeyPatch) -> None:
     port = SlowPort(deaf=20, full_n=3)
-    monkeypatch.setattr(safe_off, "open_port", lambda _: port)
-    assert safe_off.safe_off(CanSettings(), (19, 20, 27)) == 9
+    monkeypatch.setattr(sys.modules[safe_off.__module__], "open_port", lambda _: port)
+    assert safe_off(CanSettings(), (19, 20, 27)) == 9
     codec = ElectrakCodec("electrak_hd")
     told = [destination_of(f.can_id) for f in port.sent if pgn_of(f.can_id) == Pgn.PROPRIETARY_A]
     assert set(told) == {19, 20, 27}

@@ -235,6 +235,16 @@ async def test_a_driver_that_refuses_a_goal_makes_the_axis_hold_and_says_why(ben
     assert "soft limit" in bench.loop.tick.axes["rotation"].because
 
 
+async def test_a_refused_goal_ends_the_former_one_in_the_same_tick(bench: Bench) -> None:
+    await bench.arm()
+    bench.machine.rotation.stuck = True  # on its way to the first goal
+    await bench.do(cmd.Jog(axis="rotate", value=10.0, client="t"))
+    assert bench.machine.rotation.goal is not None
+    bench.machine.rotation.refuse_goal = DeviceRefusedError("rotation", "soft limit")
+    await bench.ticks(1)
+    assert bench.machine.rotation.goal is None
+
+
 async def test_an_unknown_condition_of_a_driver_stops_the_machine(bench: Bench) -> None:
     await bench.arm()
     fault = DeviceFault("rotation", "something_new", "42", bench.machine.clock.now_s())
@@ -269,7 +279,11 @@ async def test_commands_of_one_tick_get_their_own_replies_with_stop_first(bench:
 async def test_what_was_asked_before_a_stop_is_void(bench: Bench) -> None:
     """A reset or a jog that was under way when somebody pressed stop must not undo it."""
     await bench.arm()
-    asked = [cmd.Jog(axis="rotate", value=5.0, client="t"), cmd.Reset(client="t"), cmd.Arm(client="t")]
+    asked: list[cmd.Command] = [
+        cmd.Jog(axis="rotate", value=5.0, client="t"),
+        cmd.Reset(stop_n=1, client="t"),
+        cmd.Arm(client="t"),
+    ]
     tasks = [asyncio.create_task(bench.loop.command(command)) for command in asked]
     await asyncio.sleep(0)
     assert bench.loop.stop_now(cmd.Stop(reason="person near", client="u")).accepted
