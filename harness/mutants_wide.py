@@ -88,12 +88,12 @@ RUNTIME: Final = (
         "an axis whose driver refuses a goal goes on to the former one for a tick",
     ),
     Mutant(
-        "unbounded-tick",
+        "stop-decides-first",
         "graderd/runtime/control.py",
-        "MAX_COMMANDS_PER_TICK = 32\n",
-        "MAX_COMMANDS_PER_TICK = 3200\n",
-        (CONTROL + "test_a_flood_of_commands_is_worked_off_in_portions",),
-        "a flood of commands holds up the tick",
+        "        self._hold_all()\n        reply = self._step((command,))[0]\n",
+        "        reply = self._step((command,))[0]\n",
+        (CONTROL + "test_a_stop_is_on_every_wire_before_anything_else_is_asked",),
+        "a mistake in what decides stands between the stop button and the wires",
     ),
     Mutant(
         "lost-stop-input",

@@ -276,6 +276,18 @@ async def test_commands_of_one_tick_get_their_own_replies_with_stop_first(bench:
     assert not (await auto).accepted
 
 
+async def test_a_stop_is_on_every_wire_before_anything_else_is_asked(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mistake in what decides must not stand between the button and the wires."""
+    await bench.arm()
+    bench.machine.log.clear()
+    monkeypatch.setattr(bench.loop._controller, "step", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        bench.loop.stop_now(cmd.Stop(reason="person near"))
+    assert bench.machine.log == ["rotation hold", "lift_left hold", "lift_right hold", "tilt hold"]
+
+
 async def test_what_was_asked_before_a_stop_is_void(bench: Bench) -> None:
     """A reset or a jog that was under way when somebody pressed stop must not undo it."""
     await bench.arm()
