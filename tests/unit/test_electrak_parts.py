@@ -154,6 +154,9 @@ class SlowPort:
             raise PortFullError("its queue is full")
         self.sent.append(frame)
 
+    def wait_ready(self, _: float) -> bool:
+        return True
+
     def close(self) -> None:
         self.closed = True
 
