@@ -20,7 +20,7 @@ PYTHON_TARGETS ?= run test
 FIND_PYTHON = PYENV_VERSION=$* $(BIN)/uv python find --system --no-python-downloads
 SOAK_S ?= 900
 
-.PHONY: help run test quick passes test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean
+.PHONY: help run test quick passes test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean mutants mutants-wide core-coverage
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
@@ -129,6 +129,9 @@ monitor: $(STAMP) ## a million random ticks, and a thousand moves of the lifts o
 mutants: $(STAMP) ## mutate gate, state machine and fault monitor; list what the tests let live
 	@$(BIN)/python -m mutmut run $(ARGS)
 	@$(BIN)/python -m mutmut results
+
+mutants-wide: $(STAMP) ## seed thirty mistakes in runtime, drivers and interface; each must be noticed by its nearest tests
+	@$(BIN)/python -m harness.mutants_wide $(ARGS)
 
 core-coverage: $(STAMP) ## branch coverage of gate, state machine and fault monitor by their own tests (must be 100 %)
 	@$(BIN)/python -m pytest -q -n 2 --cov=graderd.core.gate --cov=graderd.core.machine --cov=graderd.core.faults --cov-branch --cov-fail-under=100 --cov-report=term-missing tests/unit/test_core_gate.py tests/unit/test_core_machine.py tests/unit/test_core_machine_model.py tests/unit/test_core_golden.py tests/unit/test_fault_catalogue.py

@@ -261,9 +261,9 @@ class Client:
         return self._request("GET", "/v1/preview.jpg")
 
     @contextmanager
-    def bus_text(self) -> Iterator[Iterator[str]]:
-        """The CAN bus as candump text, some lines a piece; a line that begins with ``#`` tells of lost frames."""
-        with self._websocket("/v1/can") as stream:
+    def bus_text(self, name: str = "can") -> Iterator[Iterator[str]]:
+        """A wire's traffic (``can``, ``servo``), some lines a piece; one that begins with ``#`` tells of lost ones."""
+        with self._websocket(f"/v1/bus/{quote(name, safe='')}") as stream:
             yield iter(lambda: str(stream.recv()), None)
 
     # -- commands ------------------------------------------------------------------------------------------------------
@@ -521,9 +521,9 @@ class AsyncClient:
         return await _in_thread(self._waiting.preview_jpeg)
 
     @asynccontextmanager
-    async def bus_text(self) -> AsyncIterator[AsyncIterator[str]]:
+    async def bus_text(self, name: str = "can") -> AsyncIterator[AsyncIterator[str]]:
         """See :meth:`Client.bus_text`."""
-        async with self._websocket("/v1/can") as stream:
+        async with self._websocket(f"/v1/bus/{quote(name, safe='')}") as stream:
 
             async def take() -> str:
                 return str(await stream.recv())

@@ -122,9 +122,14 @@ class FakeDaemon:
             raise ServiceError("no picture yet", "look at the camera's cable")
         return self.picture
 
-    async def bus_text(self) -> AsyncGenerator[str, None]:
+    def bus_text(self, name: str) -> AsyncGenerator[str, None]:
+        if name != "can":
+            raise ServiceError(f"there is no bus '{name}'", "there are: can")
+        return self._bus_text()
+
+    async def _bus_text(self) -> AsyncGenerator[str, None]:
         try:
-            for line in ("(1.000000) can0 18EF1300#DC05191500000000\n", "# 3 frames lost: the reader is too slow\n"):
+            for line in ("(1.000000) can0 18EF1300#DC05191500000000\n", "# 3 lines lost: the reader is too slow\n"):
                 yield line
             await asyncio.Event().wait()
         finally:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any
 
 from graderd.drivers.backend import Parts, RotatorBackend
+from graderd.drivers.dynamixel.dump import wire_line
 from graderd.drivers.dynamixel.ph54 import Ph54Rotator
 from graderd.drivers.dynamixel.safe_off import safe_off
-from graderd.hal.service import DeviceService, NoArguments
+from graderd.hal.service import DeviceService, NoArguments, WatchBus
 from graderd.hal.settings import CanSettings, Ph54Settings
 
 
@@ -46,4 +47,11 @@ def _services(rotator: Ph54Rotator) -> Mapping[str, DeviceService]:
     }
 
 
-PH54 = RotatorBackend(Ph54Settings, _build, _safe_off, _services)
+def _buses(rotator: Ph54Rotator) -> Mapping[str, WatchBus]:
+    def watch(listener: Callable[[str], None]) -> Callable[[], None]:
+        return rotator.tap(lambda t_s, direction, data: listener(wire_line(t_s, direction, data)))
+
+    return {"servo": watch}
+
+
+PH54 = RotatorBackend(Ph54Settings, _build, _safe_off, _services, _buses)

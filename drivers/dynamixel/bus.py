@@ -13,7 +13,7 @@ import functools
 import logging
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, Literal
 
 import serial
@@ -107,7 +107,7 @@ class Allowance:
 
 log = logging.getLogger(__name__)
 
-BusLog = Callable[[float, Literal["tx", "rx"], bytes], None]
+BusTap = Callable[[float, Literal["tx", "rx"], bytes], None]
 """Called with monotonic seconds, direction and bytes of everything that crosses the wire."""
 
 _BITS_PER_BYTE: Final = 10
@@ -139,7 +139,7 @@ class ServoBus:
         port: path of the port.
         baud_n: bits per second.
         clock: monotonic seconds for the log's times.
-        bus_log: called with every chunk of bytes sent and received.
+        taps: called with every chunk of bytes sent and received; the list may change meanwhile.
         return_delay_s: the servos' Return Delay Time (factory 500 µs), part of each deadline.
 
     ``last_valid_s``: clock time of the last valid status packet; ``unanswered_n``: requests without one since;
@@ -153,7 +153,7 @@ class ServoBus:
         baud_n: int,
         *,
         clock: Clock | None = None,
-        bus_log: BusLog | None = None,
+        taps: Sequence[BusTap] = (),
         return_delay_s: float = 0.000508,
     ) -> None:
         self.port = port
@@ -163,7 +163,7 @@ class ServoBus:
         self.last_valid_s = self.heard_s = float("-inf")
         self.unanswered_n = 0
         self._clock: Clock = clock or SystemClock()
-        self._log = bus_log
+        self._taps = taps
         self._byte_s = _BITS_PER_BYTE / baud_n
         self._return_delay_s = return_delay_s
         self._serial: serial.Serial | None = None
@@ -439,8 +439,8 @@ class ServoBus:
             self._counters["blocked_n"] += 1
             if not await self._wait_for_room(until_s):
                 return False
-        if self._log is not None:
-            self._log(self._clock.now_s(), "tx", packet)
+        for tap in self._taps:
+            tap(self._clock.now_s(), "tx", packet)
         return True
 
     def _write(self, data: bytes) -> int:
@@ -484,8 +484,8 @@ class ServoBus:
         if not data:
             self._shut(DeviceLostError(self.port, "the port vanished", "Check the USB cable"))
             return
-        if self._log is not None:
-            self._log(self._clock.now_s(), "rx", data)
+        for tap in self._taps:
+            tap(self._clock.now_s(), "rx", data)
         for packet in self._decoder.feed(data):
             self._sort(packet)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter, deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
-from graderd.drivers.dynamixel.bus import BusLog, ServoBus, ServoRefusedError
+from graderd.drivers.dynamixel.bus import BusTap, ServoBus, ServoRefusedError
 from graderd.drivers.dynamixel.device import Ph54Device
 from graderd.drivers.dynamixel.serial_port import ListPorts, find_port
 from graderd.drivers.dynamixel.table import ControlTable
@@ -56,7 +56,6 @@ class ServoLink:
         table: ControlTable,
         expected_mode: int,
         clock: Clock,
-        bus_log: BusLog | None,
         list_ports: ListPorts,
     ) -> None:
         self.firmware_version: int | None = None
@@ -71,7 +70,7 @@ class ServoLink:
         self._table = table
         self._mode = expected_mode
         self._clock = clock
-        self._bus_log = bus_log
+        self._taps: list[BusTap] = []
         self._list_ports = list_ports
         self._device: Ph54Device | None = None
 
@@ -79,6 +78,11 @@ class ServoLink:
     def is_up(self) -> bool:
         """Whether a servo was identified and its port has not been lost since."""
         return self._device is not None and self.bus is not None and self.bus.is_open
+
+    def tap(self, listener: BusTap) -> Callable[[], None]:
+        """Call ``listener`` with all bytes on the wire, over all connections; returns the call that ends it."""
+        self._taps.append(listener)
+        return lambda: self._taps.remove(listener)
 
     @property
     def device(self) -> Ph54Device:
@@ -143,7 +147,7 @@ class ServoLink:
             cause = f"{self._table.title} cannot run at {baud_n} bit/s"
             raise DeviceRefusedError("rotation", cause, f"Choose one of {rates}")
         port = find_port(s.port, s.usb_serial_number, self._list_ports)
-        self.bus = ServoBus(port, baud_n, clock=self._clock, bus_log=self._bus_log)
+        self.bus = ServoBus(port, baud_n, clock=self._clock, taps=self._taps)
         self.bus.open()
         self.slow_adapter = self._judge_adapter(self.bus)
         return Ph54Device(self.bus, self._table, s.servo_id_n)

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 
 from graderd.drivers.dynamixel import arming
-from graderd.drivers.dynamixel.bus import BusLog
+from graderd.drivers.dynamixel.bus import BusTap
 from graderd.drivers.dynamixel.calibration import Calibration
 from graderd.drivers.dynamixel.connection import Found, ServoLink, condition_of
 from graderd.drivers.dynamixel.device import EXTENDED_MODE, POSITION_MODE, Difference
@@ -45,7 +46,6 @@ class Ph54Rotator:
     Args:
         settings: port, calibration, limits, timeouts.
         clock: monotonic seconds for readings and goal timeouts.
-        bus_log: called with all bytes on the wire, for the recorder.
         list_ports: lists serial ports; for finding the adapter by USB serial number.
     """
 
@@ -53,7 +53,6 @@ class Ph54Rotator:
         self,
         settings: Ph54Settings,
         clock: Clock | None = None,
-        bus_log: BusLog | None = None,
         *,
         list_ports: ListPorts = system_ports,
     ) -> None:
@@ -62,7 +61,7 @@ class Ph54Rotator:
         self.calibration = Calibration.of(settings, self.table)
         self._mode = EXTENDED_MODE if self.calibration.needs_turns else POSITION_MODE
         self._clock: Clock = clock or SystemClock()
-        self._link = ServoLink(settings, self.table, self._mode, self._clock, bus_log, list_ports)
+        self._link = ServoLink(settings, self.table, self._mode, self._clock, list_ports)
         self._observer = ServoObserver(DEVICE, settings, self.table, self.calibration, self._clock)
         self._command = CommandSlot(settings, self.calibration)
         self._keeper = ServoTask(settings, self._link, self._observer, self._command, self._clock)
@@ -93,6 +92,10 @@ class Ph54Rotator:
         """Conditions present now. Events (trips, lost turns) stay visible for a second after they happened."""
         present = self._observer.faults.present(self._clock.now_s())
         return (*present, *(fault for fault in (self._link.slow_adapter, self._link.lossy) if fault is not None))
+
+    def tap(self, listener: BusTap) -> Callable[[], None]:
+        """Call ``listener`` with all bytes on the wire, whoever sent them; returns the call that ends it."""
+        return self._link.tap(listener)
 
     async def wait_telemetry(self) -> RotatorTelemetry:
         """The next telemetry, as soon as it was read (or the connection's state changed)."""

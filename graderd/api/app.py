@@ -28,8 +28,8 @@ every field's name, or stands in the field `unit` beside it.
 Anything that is refused is answered with the same three fields: `error` (why), `where` (which command, field or
 header) and `remedy` (what to do).
 
-Three paths are WebSockets: `/v1/stream`, `/v1/jog` and `/v1/can`. Messages are JSON texts, those of `/v1/can` candump
-lines.
+Three paths are WebSockets: `/v1/stream`, `/v1/jog` and `/v1/bus/{name}`. Messages are JSON texts, those of
+`/v1/bus/{name}` lines of a wire's traffic.
 """
 
 

@@ -50,8 +50,12 @@ class DaemonPort(Protocol):
         """
         ...
 
-    def bus_text(self) -> AsyncGenerator[str, None]:
-        """The CAN bus from now on as candump text, some lines at a time; ends when it is closed."""
+    def bus_text(self, name: str) -> AsyncGenerator[str, None]:
+        """What is on a wire (``can``, ``servo``) from now on, some lines at a time; ends when it is closed.
+
+        Raises:
+            ServiceError: there is no such wire.
+        """
         ...
 
     def services(self) -> Mapping[str, DeviceService]:

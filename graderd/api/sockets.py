@@ -1,10 +1,10 @@
-"""The WebSockets: the status stream, the CAN bus, and the jog whose lease ends with its connection."""
+"""The WebSockets: the status stream, the wires, and the jog whose lease ends with its connection."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Coroutine
+from collections.abc import AsyncGenerator, Coroutine
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, WebSocket
@@ -13,12 +13,13 @@ from starlette.websockets import WebSocketDisconnect
 
 from graderd.api.http_routes import ConnectionNames, StatusTexts, obey
 from graderd.api.limiter import Closing
-from graderd.api.port import DaemonPort
-from graderd.api.problem import Problem, ProblemError, problem_of_validation
+from graderd.api.port import DaemonPort, ServiceError
+from graderd.api.problem import Problem, ProblemError, answer, problem_of_validation
 from graderd.api.settings import ApiLimits
 from graderd.api.stop import StopLane, is_stop_command
 from graderd.core.commands import AnyCommand, Command, Jog, Preset, Release, Reply
 from graderd.core.status import Status
+from graderd.hal.text import printable
 
 COMMAND: TypeAdapter[Command] = TypeAdapter(AnyCommand)
 MALFORMED_PAUSE_S = 0.1
@@ -51,10 +52,16 @@ def socket_routes(
         finally:
             await session.release()
 
-    @router.websocket("/can")
-    async def can(socket: WebSocket) -> None:
+    @router.websocket("/bus/{name}")
+    async def bus(socket: WebSocket, name: str) -> None:
+        try:
+            texts = port.bus_text(name)
+        except ServiceError as error:
+            problem = Problem(error=error.message, where=f"bus {printable(name)[:60]}", remedy=error.remedy)
+            await answer(404, problem, socket.scope, socket.receive, socket.send)
+            return
         await socket.accept()
-        await _until_closed(socket, _send_bus(socket, port), closing)
+        await _until_closed(socket, _send_texts(socket, texts), closing)
 
     @router.get("/stream", tags=["status"], summary="WebSocket: status as it changes", responses=UPGRADE_ONLY)
     async def stream_needs_upgrade(
@@ -73,11 +80,12 @@ def socket_routes(
         connection ends for whatever reason, and lapses by itself 0.3 s after the last `renew`."""
         raise _upgrade_needed("jog")
 
-    @router.get("/can", tags=["status"], summary="WebSocket: the CAN bus as it is", responses=UPGRADE_ONLY)
-    async def can_needs_upgrade() -> str:
-        """Every frame the daemon receives or sends, as candump text, some lines a message. Times are the daemon's
-        monotonic clock. A slow client loses frames and is told how many in a line that begins with `#`."""
-        raise _upgrade_needed("can")
+    @router.get("/bus/{name}", tags=["status"], summary="WebSocket: a wire as it is", responses=UPGRADE_ONLY)
+    async def bus_needs_upgrade(name: str) -> str:
+        """Everything the daemon receives or sends on the CAN bus (`can`, candump text) or on the servo's wire (`servo`,
+        `(seconds) servo rx|tx BYTES`), some lines a message. Times are the daemon's monotonic clock. A slow client
+        loses the oldest lines and is told how many in a line that begins with `#`."""
+        raise _upgrade_needed(f"bus/{printable(name)[:60]}")
 
     return router
 
@@ -147,8 +155,8 @@ async def _send_status(socket: WebSocket, port: DaemonPort, texts: StatusTexts, 
         await asyncio.sleep(max(0.0, due_s - loop.time()))
 
 
-async def _send_bus(socket: WebSocket, port: DaemonPort) -> None:
-    async with contextlib.aclosing(port.bus_text()) as texts:
+async def _send_texts(socket: WebSocket, texts: AsyncGenerator[str, None]) -> None:
+    async with contextlib.aclosing(texts):
         async for text in texts:
             await socket.send_text(text)
 

@@ -28,3 +28,8 @@ class DeviceService:
     moves: bool = False
     arguments: type[Settings] = NoArguments
     summary: str = "A device service outside the control loop"
+
+
+WatchBus = Callable[[Callable[[str], None]], Callable[[], None]]
+"""Calls a listener with everything on a wire from now on, received or sent, each a line of text; returns the call that
+ends it. Nobody listening costs nothing."""

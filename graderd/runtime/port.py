@@ -15,7 +15,7 @@ from graderd.core.commands import Command, Reply, Stop
 from graderd.core.machine import Mode
 from graderd.core.status import Status
 from graderd.hal.errors import DeviceError
-from graderd.hal.service import DeviceService
+from graderd.hal.service import DeviceService, WatchBus
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
@@ -92,8 +92,15 @@ class Port:
         except TimeoutError:
             raise ServiceError("the camera gives no picture", "see graderd status for its fault") from None
 
-    async def bus_text(self) -> AsyncGenerator[str, None]:
-        """What is on the CAN bus from now on; a reader that is slow loses the oldest lines and is told how many."""
+    def bus_text(self, name: str) -> AsyncGenerator[str, None]:
+        """What is on a wire from now on; a reader that is slow loses the oldest lines and is told how many."""
+        watch = self._devices.buses.get(name)
+        if watch is None:
+            known = ", ".join(sorted(self._devices.buses))
+            raise ServiceError(f"there is no bus '{name}'", f"there are: {known}")
+        return self._bus_text(watch)
+
+    async def _bus_text(self, watch: WatchBus) -> AsyncGenerator[str, None]:
         lines: deque[str] = deque(maxlen=BUS_LINES_N)
         arrived, heard_n = asyncio.Event(), 0
 
@@ -103,7 +110,7 @@ class Port:
             lines.append(line)
             arrived.set()
 
-        end = self._devices.watch_bus(hear)
+        end = watch(hear)
         try:
             while True:
                 await arrived.wait()
@@ -112,7 +119,7 @@ class Port:
                 text = "".join(f"{line}\n" for line in lines)
                 lines.clear()
                 arrived.clear()
-                yield f"# {lost_n} frames lost: the reader is too slow\n{text}" if lost_n else text
+                yield f"# {lost_n} lines lost: the reader is too slow\n{text}" if lost_n else text
         finally:
             end()
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from graderd.drivers.dynamixel import Ph54Rotator
+from graderd.drivers.dynamixel import Ph54Rotator, servo_task
+from graderd.drivers.dynamixel.connection import ServoLink
 from graderd.drivers.dynamixel.servo_task import ServoTask
 from graderd.hal.errors import (
     DeviceError,
@@ -155,6 +156,26 @@ async def test_an_unexpected_exception_does_not_end_the_search(rig: Bench, monke
         patch.setattr(ServoTask, "_cycle", lambda *_, **__: 1 / 0)
         await rig.until(lambda: rig.rotator.lifecycle is Lifecycle.FAILED)
     await works_again(rig)
+
+
+async def test_the_pause_between_two_looks_for_a_lost_servo_is_bounded(
+    rig: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long it was away, it is found soon after it is back: twenty doublings would be days."""
+    looks: list[float] = []
+
+    async def absent(_: ServoLink) -> None:
+        looks.append(rig.clock.now_s())
+        raise DeviceMissingError("/dev/servo", "no such serial port")
+
+    monkeypatch.setattr(servo_task, "_RECONNECT_FIRST_S", 0.001)
+    monkeypatch.setattr(servo_task, "_RECONNECT_MOST_S", 0.01)
+    with monkeypatch.context() as patch:
+        patch.setattr(ServoLink, "connect", absent)
+        await rig.bus.unplug()
+        await rig.until(lambda: len(looks) > 20, "no more looks for the servo")
+    await rig.bus.replug()
+    await rig.until(lambda: rig.rotator.lifecycle is Lifecycle.STANDBY, "not found again")
 
 
 async def test_a_reboot_needs_standby(rig: Bench) -> None:

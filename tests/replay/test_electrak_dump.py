@@ -319,7 +319,7 @@ def test_the_command_line_writes_json_and_survives_a_closed_pipe(tmp_path: Path)
 
 
 def test_candump_text_on_standard_input_is_read_and_what_is_written_is_read_again() -> None:
-    text = "# 2 frames lost: the reader is too slow\n" + "".join(f"{candump_line(f, t)}\n" for t, f in FRAMES)
+    text = "# 2 lines lost: the reader is too slow\n" + "".join(f"{candump_line(f, t)}\n" for t, f in FRAMES)
     done = subprocess.run(
         [sys.executable, "-m", "graderd.drivers.electrak.dump", "-", "--json"],
         input=text, capture_output=True, text=True, check=True,

@@ -147,7 +147,7 @@ async def test_paths_and_methods_that_do_not_exist(tmp_path: Path) -> None:
         assert (await client.get("/nothing")).status_code == 404
         assert (await client.get("/nothing")).json()["where"] == "/nothing"
         assert (await client.delete("/v1/status")).status_code == 405
-        for stream in ("/v1/stream", "/v1/jog", "/v1/can"):
+        for stream in ("/v1/stream", "/v1/jog", "/v1/bus/can"):
             answer = await client.get(stream)
             assert answer.status_code == 426
             assert "WebSocket" in answer.json()["error"]
@@ -264,7 +264,7 @@ async def test_the_description_is_complete(tmp_path: Path) -> None:
         "/v1/services/rotation.step_response",
         "/v1/stream",
         "/v1/jog",
-        "/v1/can",
+        "/v1/bus/{name}",
     }
     for operations in paths.values():
         for operation in operations.values():
@@ -283,6 +283,22 @@ async def test_the_description_is_complete(tmp_path: Path) -> None:
     schemas = set(re.findall(r'"#/components/schemas/(\w+)"', text))
     assert schemas <= set(description["components"]["schemas"])
     assert {"Status", "Reply", "Problem", "AxisStatus", "FaultStatus"} <= schemas
+
+
+async def test_the_oldest_connection_makes_room_for_a_new_one(tmp_path: Path) -> None:
+    """Whoever wants to stop the machine gets in, however many connections hang about."""
+    async with serving(tmp_path, limits=ApiLimits(connections_max_n=4)) as (daemon, path):
+        idle = [await asyncio.open_unix_connection(str(path)) for _ in range(4)]
+        async with client_of(path) as client:
+            assert (await client.post("/v1/stop")).status_code == 200
+        assert daemon.status().mode is Mode.STOPPED
+        with contextlib.suppress(ConnectionResetError):
+            assert await within(5, idle[0][0].read()) == b""
+        assert not idle[1][0].at_eof()
+        for _, writer in idle:
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
 
 
 async def test_requests_that_wait_when_the_daemon_ends_are_answered(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import subprocess
 import sys
 from pathlib import Path
@@ -46,7 +47,7 @@ def test_every_command_has_help_with_an_example_and_json(words: list[str]) -> No
 def test_all_commands_of_the_issue_are_there() -> None:
     assert {" ".join(words) for words in leaf_commands()} >= {
         *("run", "demo", "rig", "guard", "status", "arm", "disarm", "stop", "reset", "auto", "manual", "jog"),
-        *("preset", "explain", "config check", "config show", "rotation reboot", "rotation step"),
+        *("preset", "explain", "config check", "config show", "rotation reboot", "rotation step", "rotation dump"),
         *("profile verify", "can dump", "classify", "calibrate camera"),
     }
 
@@ -139,6 +140,7 @@ def test_config_show_prints_a_file_that_is_valid_again(tmp_path: Path, capsys: C
         (["can", "dump", "can0", "--json"], "graderd.drivers.electrak.dump", ["can0", "--json"]),
         (["can", "database", "--kcd"], "graderd.runtime.app.can_database", ["--kcd"]),
         (["can", "dump", "--", "--help"], "graderd.drivers.electrak.dump", ["--help"]),
+        (["rotation", "dump", "x.log", "--json"], "graderd.drivers.dynamixel.dump", ["x.log", "--json"]),
         (["demo", "--json"], "graderd.simulator.demo", ["--json"]),
     ],
 )
@@ -169,13 +171,17 @@ def test_run_and_guard_give_the_daemons_exit_status(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("graderd.runtime.app.run_daemon", fake("daemon", 1))
     monkeypatch.setattr("graderd.runtime.app.run_guard", fake("guard", 1))
     assert run_app(["run", "--config", "c.toml", "--rig-dir", "r", "--json"]) == 1
+    assert run_app(["run", "--sim", "--log-level", "error"]) == 1
     assert run_app(["guard", "--config", "c.toml", "--json"]) == 1
     assert calls == [
-        ("daemon", Path("c.toml"), False, Path("r"), True),
+        ("daemon", Path("c.toml"), False, Path("r"), True, logging.INFO),
+        ("daemon", None, True, None, False, logging.ERROR),
         ("guard", Path("c.toml")),
     ]
     assert json.loads(capsys.readouterr().out) == {"safe": False}
     assert run_app(["run", "--sim", "--rig-dir", "r"]) == 2
+    assert run_app(["run", "--log-level", "all"]) == 2
+    assert "'debug', 'info', 'warning', 'error'" in capsys.readouterr().err
 
 
 async def test_services_of_the_servo_want_consent(tmp_path: Path, capsys: Capture) -> None:

@@ -49,6 +49,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         (["stop"], 3),
         (["preset", "transport"], 3),
         (["can", "dump"], 3),
+        (["rotation", "dump"], 3),
         (["run"], 2),
         (["config", "check"], 1),
         (["config", "show"], 1),

@@ -283,6 +283,16 @@ async def test_a_driver_that_refuses_a_goal_makes_the_axis_hold_and_says_why(ben
     assert "soft limit" in bench.loop.tick.axes["rotation"].because
 
 
+async def test_a_refused_goal_ends_the_former_one_in_the_same_tick(bench: Bench) -> None:
+    await bench.arm()
+    bench.machine.rotation.stuck = True  # on its way to the first goal
+    await bench.do(cmd.Jog(axis="rotate", value=10.0, client="t"))
+    assert bench.machine.rotation.goal is not None
+    bench.machine.rotation.refuse_goal = DeviceRefusedError("rotation", "soft limit")
+    await bench.ticks(1)
+    assert bench.machine.rotation.goal is None
+
+
 async def test_an_unknown_condition_of_a_driver_stops_the_machine(bench: Bench) -> None:
     await bench.arm()
     fault = DeviceFault("rotation", "something_new", "42", bench.machine.clock.now_s())
@@ -312,6 +322,42 @@ async def test_commands_of_one_tick_get_their_own_replies_with_stop_first(bench:
     assert (await jog).command == "jog"
     assert (await jog).accepted
     assert not (await auto).accepted
+
+
+async def test_a_stop_is_on_every_wire_before_anything_else_is_asked(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mistake in what decides must not stand between the button and the wires."""
+    await bench.arm()
+    bench.machine.log.clear()
+    monkeypatch.setattr(bench.loop._controller, "step", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        bench.loop.stop_now(cmd.Stop(reason="person near"))
+    assert bench.machine.log == ["rotation hold", "lift_left hold", "lift_right hold", "tilt hold"]
+
+
+async def test_what_was_asked_before_a_stop_is_void(bench: Bench) -> None:
+    """A reset or a jog that was under way when somebody pressed stop must not undo it."""
+    await bench.arm()
+    asked: list[cmd.Command] = [
+        cmd.Jog(axis="rotate", value=5.0, client="t"),
+        cmd.Reset(stop_n=1, client="t"),
+        cmd.Arm(client="t"),
+    ]
+    tasks = [asyncio.create_task(bench.loop.command(command)) for command in asked]
+    await asyncio.sleep(0)
+    assert bench.loop.stop_now(cmd.Stop(reason="person near", client="u")).accepted
+    await bench.ticks(2)
+    replies = [await task for task in tasks]
+    assert [(reply.accepted, reply.message) for reply in replies] == [(False, "a stop came first")] * 3
+    assert bench.loop.tick.state.mode is Mode.STOPPED
+
+
+async def test_a_device_that_is_active_while_it_should_not_be_is_disarmed(bench: Bench) -> None:
+    await bench.ticks(2)
+    bench.machine.tilt.lifecycle = Lifecycle.ACTIVE
+    await bench.ticks(2)
+    assert bench.machine.tilt.lifecycle is Lifecycle.STANDBY
 
 
 async def test_a_flood_of_commands_is_worked_off_in_portions(bench: Bench) -> None:

@@ -200,6 +200,25 @@ def test_a_loop_that_ticks_is_not_told_of_and_its_ticks_cost_little(capfd: pytes
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.parametrize(
+    ("level", "told"),
+    [
+        (logging.DEBUG, ["d", "i", "w", "e", "library w", "library e"]),
+        (logging.INFO, ["i", "w", "e", "library w", "library e"]),
+        (logging.WARNING, ["w", "e", "library w", "library e"]),
+        (logging.ERROR, ["e", "library e"]),
+    ],
+)
+def test_the_level_is_of_our_own_entries_and_libraries_stay_quiet(
+    level: int, told: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    set_up_logging(as_json=True, level=level)
+    for name, prefix in (("graderd.x", ""), ("numexpr", "library ")):
+        for at in (logging.DEBUG, logging.INFO, logging.WARNING, logging.ERROR):
+            logging.getLogger(name).log(at, "%s%s", prefix, logging.getLevelName(at)[0].lower())
+    assert [json.loads(line)["message"] for line in capsys.readouterr().err.splitlines()] == told
+
+
 def test_every_logger_of_ours_is_told_at_info() -> None:
     set_up_logging(as_json=False)
     assert logging.getLogger("graderd.drivers.dynamixel.servo_task").isEnabledFor(logging.INFO)

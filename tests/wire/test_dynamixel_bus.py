@@ -205,7 +205,7 @@ async def test_a_cancelled_request_leaves_the_wire_usable(bus: ServoBus, servos:
 
 async def test_every_byte_is_logged(servos: VirtualServoBus) -> None:
     log: list[tuple[float, str, bytes]] = []
-    bus = ServoBus(str(servos.link), 57_600, bus_log=lambda t, d, b: log.append((t, d, b)))
+    bus = ServoBus(str(servos.link), 57_600, taps=[lambda t, d, b: log.append((t, d, b))])
     bus.open()
     await bus.ping(1)
     bus.close()

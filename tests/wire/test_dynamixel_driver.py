@@ -48,7 +48,8 @@ async def tapped(tmp_path: Path, servo: VirtualServo, **changes: float) -> tuple
     wire = VirtualServoBus([servo], tmp_path / "servo", clock=clock)
     await wire.start()
     tap = Tap()
-    rotator = Ph54Rotator(Ph54Settings(**{"port": str(tmp_path / "servo"), **changes}), clock=clock, bus_log=tap)
+    rotator = Ph54Rotator(Ph54Settings(**{"port": str(tmp_path / "servo"), **changes}), clock=clock)
+    rotator.tap(tap)
     await rotator.open()
     return tap, rotator, wire
 
@@ -59,6 +60,24 @@ async def test_opening_writes_nothing_but_the_status_return_level(tmp_path: Path
     await rotator.close()
     await wire.close()
     assert tap.writes() == [(TABLE["status_return_level"].address, b"\x02")]
+
+
+async def test_a_tap_hears_every_connection_until_it_ends(tmp_path: Path) -> None:
+    tap, rotator, wire = await tapped(tmp_path, VirtualServo())
+    await wire.unplug()
+    await until(lambda: rotator.lifecycle is Lifecycle.FAILED, "not failed")
+    before_n = len(tap.sent)
+    await wire.replug()
+    await until(lambda: len(tap.sent) > before_n, "nothing of the new connection")
+    second = Tap()
+    end = rotator.tap(second)
+    await until(lambda: second.sent, "nothing heard")
+    end()
+    heard_n, before_n = len(second.sent), len(tap.sent)
+    await until(lambda: len(tap.sent) > before_n + 3, "the first hears no more")
+    assert len(second.sent) == heard_n
+    await rotator.close()
+    await wire.close()
 
 
 async def test_hold_is_the_very_next_packet(tmp_path: Path) -> None:

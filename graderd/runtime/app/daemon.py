@@ -41,9 +41,11 @@ ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 log = logging.getLogger("graderd")
 
 
-def run_daemon(config_path: Path | None, sim: bool, rig_dir: Path | None, as_json: bool) -> int:
+def run_daemon(
+    config_path: Path | None, sim: bool, rig_dir: Path | None, as_json: bool, log_level: int = logging.INFO
+) -> int:
     """Run until SIGINT, SIGTERM or SIGHUP. Returns the exit status: 0 after a clean end, 1 where it could not run."""
-    set_up_logging(as_json)
+    set_up_logging(as_json, log_level)
     try:
         config = load(config_path)
         refusals = problems(config)

@@ -45,7 +45,7 @@ def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], Non
     def publish(faults: tuple[DeviceFault, ...], stopped: bool) -> None:
         link.publish_faults(faults, stopped=stopped)
 
-    def watch_bus(listener: Callable[[str], None]) -> Callable[[], None]:
+    def watch_can(listener: Callable[[str], None]) -> Callable[[], None]:
         def write(item: Frame | BusEvent, now_s: float) -> None:
             listener(candump_line(item, now_s))
 
@@ -63,7 +63,7 @@ def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], Non
         actuators=actuators,
         services=services,
         publish_faults=publish,
-        watch_bus=watch_bus,
+        buses={"can": watch_can, **backend.buses(rotator)},
         vehicle=_vehicle(config, link, clock),
     )
 

@@ -200,14 +200,15 @@ class _StandardError(logging.Handler):
         """As :attr:`lock`."""
 
 
-def set_up_logging(as_json: bool) -> None:
+def set_up_logging(as_json: bool, level: int = logging.INFO) -> None:
     """One line an event, repeated ones ever more rarely: to the journal where standard error is the journal's, else to
-    standard error (a terminal gets the time from us)."""
+    standard error (a terminal gets the time from us). ``level``: the least that graderd's own entries must have; what
+    libraries say counts from warning on, or from ``level`` where that is higher."""
     handler = LaterHandler(_handler(as_json))
     handler.addFilter(RepeatFilter())
-    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
-    logging.getLogger("graderd").setLevel(logging.INFO)
-    logging.getLogger("can").setLevel(logging.ERROR)
+    logging.basicConfig(level=max(logging.WARNING, level), handlers=[handler], force=True)
+    logging.getLogger("graderd").setLevel(level)
+    logging.getLogger("can").setLevel(max(logging.ERROR, level))
 
 
 def _handler(as_json: bool) -> logging.Handler:
