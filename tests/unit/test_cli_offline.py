@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import subprocess
 import sys
@@ -206,6 +207,16 @@ def test_the_module_and_the_command_are_the_same(tmp_path: Path) -> None:
 @pytest.mark.parametrize("module", ["graderd.runtime.app.guard", "graderd.runtime.app.daemon"])
 def test_daemon_and_guard_load_no_opencv(module: str) -> None:
     code = f"import sys, {module}; sys.exit('cv2' in sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False)
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.parametrize(
+    "module", ["graderd.runtime.app.guard", "graderd.runtime.app.daemon", "graderd.simulator.process"]
+)
+def test_no_process_loads_what_only_mf4_logs_need(module: str) -> None:
+    assert importlib.util.find_spec("asammdf"), "else it proves nothing"
+    code = f"import sys, {module}; sys.exit('asammdf' in sys.modules or 'pandas' in sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False)
     assert run.returncode == 0, run.stderr
 
