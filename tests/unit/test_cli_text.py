@@ -21,6 +21,8 @@ from graderd.runtime.sd_notify import SystemdNotifier
 from harness.api_daemon import serving, within
 from tests.unit.test_cli_modes import Capture, cli
 
+pytestmark = pytest.mark.live
+
 HOSTILE = "stop\nmode  auto: all is well\x1b[2J\x1b]0;title\x07\x9b31m\u202e\r"
 SHOWN = "stop\\nmode  auto: all is well\\x1b[2J\\x1b]0;title\\x07\\x9b31m\\u202e\\r"
 

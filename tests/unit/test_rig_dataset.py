@@ -153,6 +153,7 @@ def test_rig_set_depth_shows_the_volumes_it_is_labelled_with() -> None:
     assert checked >= 2
 
 
+@pytest.mark.live
 def test_rig_set_is_not_overwritten_and_bad_arguments_are_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
