@@ -22,6 +22,8 @@ from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.blade import volumes_in_front_m3
 from graderd.simulator.scenes import label_of, random_scene
 
+pytestmark = pytest.mark.xdist_group("rig dataset")  # one set of pictures for all
+
 SCENES = 6
 
 
