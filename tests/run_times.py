@@ -41,7 +41,9 @@ def by_file(reports: Iterable[pytest.TestReport]) -> list[tuple[str, float, floa
     for report in reports:
         file = report.nodeid.partition("::")[0]
         wall_s[file] += report.duration
-        processor_s[file] += sum(seconds for name, seconds in report.user_properties if name == "processor_s")
+        processor_s[file] += sum(
+            seconds for name, seconds in report.user_properties if name == "processor_s" and isinstance(seconds, float)
+        )
         tests[file].add(report.nodeid)
     return [(f, wall_s[f], processor_s[f], len(tests[f])) for f in sorted(wall_s, key=wall_s.__getitem__, reverse=True)]
 
