@@ -74,7 +74,7 @@ test: $(STAMP) ## run the tests; run times by file at the end of each part
 	@$(TESTS) -m serial_only $(PYTEST_ARGS)
 
 unit: $(STAMP) ## run the pure tests: no process, no socket, seconds
-	@$(TESTS) $(BESIDE) -m "not live and not serial_only" $(PYTEST_ARGS) tests/unit
+	@$(TESTS) $(BESIDE) -m "not live and not serial_only and not slow" $(PYTEST_ARGS) tests/unit
 
 quick: $(STAMP) ## run the tests of functions, contracts and wires that take no ten seconds each
 	@$(TESTS) $(BESIDE) -m "not serial_only and not slow" $(PYTEST_ARGS) tests/unit tests/contract tests/wire

@@ -28,7 +28,7 @@ from graderd.perception.frame_set import Entry, FrameSetWriter
 from graderd.perception.settings import StreamCalibration
 from harness.perception_scenes import Scene, render
 
-pytestmark = pytest.mark.xdist_group("calibrate cli")  # one set of pictures for all
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("calibrate cli")]  # one set of pictures for all
 
 Captured = pytest.CaptureFixture[str]
 COLOR, DEPTH = (480, 300), (424, 240)

@@ -180,6 +180,7 @@ def test_run_and_guard_give_the_daemons_exit_status(monkeypatch: pytest.MonkeyPa
     assert run_app(["run", "--sim", "--rig-dir", "r"]) == 2
 
 
+@pytest.mark.live
 async def test_services_of_the_servo_want_consent(tmp_path: Path, capsys: Capture) -> None:
     async with serving(tmp_path) as (_, path):
         assert await cli(path, "rotation", "reboot") == 2
