@@ -84,6 +84,7 @@ def test_a_traceback_stays_one_entry() -> None:
     assert got["PRIORITY"] == "3"
 
 
+@pytest.mark.live
 def test_what_the_journal_does_not_take_is_written_all_the_same(tmp_path: Path) -> None:
     kept: list[str] = []
 

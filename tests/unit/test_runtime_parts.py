@@ -54,6 +54,7 @@ def test_a_state_directory_that_cannot_be_written_is_told_and_raises_nothing(tmp
     assert state.problem
 
 
+@pytest.mark.live
 def test_systemd_is_told_ready_status_watchdog_and_stopping(tmp_path: Path) -> None:
     path = tmp_path / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
