@@ -20,7 +20,10 @@ PYTHON_TARGETS ?= run test
 FIND_PYTHON = PYENV_VERSION=$* $(BIN)/uv python find --system --no-python-downloads
 SOAK_S ?= 900
 
-.PHONY: help run test quick passes test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean mutants mutants-wide core-coverage
+TESTS  := $(BIN)/python -m pytest -p tests.run_times
+BESIDE := -n 2 --dist loadgroup
+
+.PHONY: help run test unit quick passes test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean mutants mutants-wide core-coverage
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
@@ -66,12 +69,15 @@ $(STAMP): $(LOCKED) pyproject.toml
 run: $(STAMP) ## drive the demonstration on the simulated grader (ARGS=--json for one object a line)
 	@$(BIN)/graderd demo $(ARGS)
 
-test: $(STAMP) ## run the tests
-	@$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not serial_only" $(PYTEST_ARGS)
-	@$(BIN)/python -m pytest -m serial_only $(PYTEST_ARGS)
+test: $(STAMP) ## run the tests; run times by file at the end of each part
+	@$(TESTS) $(BESIDE) -m "not serial_only" $(PYTEST_ARGS)
+	@$(TESTS) -m serial_only $(PYTEST_ARGS)
+
+unit: $(STAMP) ## run the pure tests: no process, no socket, seconds
+	@$(TESTS) $(BESIDE) -m "not live and not serial_only and not slow" $(PYTEST_ARGS) tests/unit
 
 quick: $(STAMP) ## run the tests of functions, contracts and wires that take no ten seconds each
-	@$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not serial_only and not slow" $(PYTEST_ARGS) tests/unit tests/contract tests/wire
+	@$(TESTS) $(BESIDE) -m "not serial_only and not slow" $(PYTEST_ARGS) tests/unit tests/contract tests/wire
 
 test-pythons: $(PYTHONS:%=test-python-%) ## both commands on each Python that README names, one after the other
 

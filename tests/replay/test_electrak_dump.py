@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import can
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,6 +18,7 @@ from graderd.drivers.j1939.bus_health import BusEvent
 from graderd.drivers.j1939.can_logs import candump_line, parse_candump_line, read_file
 from graderd.drivers.j1939.dm1 import dtc_of, encode
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id
+from graderd.drivers.j1939.python_can import can
 from graderd.drivers.j1939.transport import Transport
 from graderd.hal.errors import ProtocolError
 

@@ -16,6 +16,8 @@ from graderd.core.machine import Mode
 from harness.api_daemon import TICK_S, serving, within
 from tests.unit.test_cli_modes import command_line
 
+pytestmark = pytest.mark.live
+
 FLOOD_S = 2.5
 
 

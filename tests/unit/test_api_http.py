@@ -24,6 +24,8 @@ from graderd.core.machine import Mode, Unmet
 from graderd.core.status import Status
 from harness.api_daemon import JPEG, FakeDaemon, serving, within
 
+pytestmark = pytest.mark.live
+
 
 @contextlib.asynccontextmanager
 async def client_of(path: Path) -> AsyncIterator[httpx.AsyncClient]:

@@ -18,6 +18,8 @@ from graderd.core.machine import MachineSettings, Mode
 from graderd.core.status import Status
 from harness.api_daemon import FakeDaemon, serving, within
 
+pytestmark = pytest.mark.live
+
 
 def connect(path: Path, target: str) -> Any:
     return unix_connect(str(path), f"ws://localhost{target}", compression=None)

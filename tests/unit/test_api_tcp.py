@@ -26,6 +26,8 @@ from graderd.core.machine import Mode
 from graderd.hal.errors import DeviceError
 from harness.api_daemon import FakeDaemon, longest_hold, serving, within
 
+pytestmark = pytest.mark.live
+
 HOLD_S = 0.05
 """What the interface may keep the tick waiting, in computing time: what else the machine does does not count."""
 

@@ -30,6 +30,7 @@ def jogs(daemon: FakeDaemon) -> list[float]:
     return [command.value for command in daemon.seen if isinstance(command, cmd.Jog) and command.axis == "slope"]
 
 
+@pytest.mark.live
 async def test_left_is_left(tmp_path: Path, capsys: Capture, answers: list[Any]) -> None:
     async with serving(tmp_path) as (daemon, path):
         await cli(path, "arm")
@@ -39,6 +40,7 @@ async def test_left_is_left(tmp_path: Path, capsys: Capture, answers: list[Any])
         assert jogs(daemon) == [1.0, -1.0], "there and back"
 
 
+@pytest.mark.live
 async def test_swapped_ends_are_exchanged_in_the_configuration(
     tmp_path: Path, capsys: Capture, answers: list[Any]
 ) -> None:
@@ -61,6 +63,7 @@ async def test_swapped_ends_are_exchanged_in_the_configuration(
     ("said", "says"),
     [([True, "right", False], "cancelled; nothing was changed"), ([True, "neither"], "the blade did not move")],
 )
+@pytest.mark.live
 async def test_nothing_is_written_without_consent_or_reason(
     tmp_path: Path, capsys: Capture, answers: list[Any], said: list[Any], says: str
 ) -> None:
@@ -74,6 +77,7 @@ async def test_nothing_is_written_without_consent_or_reason(
     assert not config.exists()
 
 
+@pytest.mark.live
 async def test_nothing_moves_without_consent(tmp_path: Path, answers: list[Any]) -> None:
     async with serving(tmp_path) as (daemon, path):
         await cli(path, "arm")

@@ -26,6 +26,8 @@ from graderd.core.status import FaultStatus
 from harness.api_daemon import FakeDaemon, serving, within
 from tests.unit.test_cli_modes import Capture, cli, command_line
 
+pytestmark = pytest.mark.live
+
 
 @pytest.mark.parametrize(
     ("axis", "text", "expected"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import logging
 import subprocess
@@ -83,6 +84,7 @@ def test_explain_lists_all_and_suggests_the_nearest(capsys: Capture) -> None:
         ("[camera]\nrate_hz = -1\n", "camera.rate_hz"),
     ],
 )
+@pytest.mark.live
 def test_check_refuses_what_run_refuses_and_run_before_anything_starts(
     tmp_path: Path, text: str, says: str, capsys: Capture
 ) -> None:
@@ -184,6 +186,7 @@ def test_run_and_guard_give_the_daemons_exit_status(monkeypatch: pytest.MonkeyPa
     assert "'debug', 'info', 'warning', 'error'" in capsys.readouterr().err
 
 
+@pytest.mark.live
 async def test_services_of_the_servo_want_consent(tmp_path: Path, capsys: Capture) -> None:
     async with serving(tmp_path) as (_, path):
         assert await cli(path, "rotation", "reboot") == 2
@@ -196,6 +199,7 @@ async def test_services_of_the_servo_want_consent(tmp_path: Path, capsys: Captur
         assert "as its profile says" in capsys.readouterr().out
 
 
+@pytest.mark.live
 def test_the_module_and_the_command_are_the_same(tmp_path: Path) -> None:
     run = subprocess.run(
         [sys.executable, "-m", "graderd.cli", "--socket", str(tmp_path / "none"), "stop", "--json"],
@@ -210,12 +214,25 @@ def test_the_module_and_the_command_are_the_same(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("module", ["graderd.runtime.app.guard", "graderd.runtime.app.daemon"])
+@pytest.mark.live
 def test_daemon_and_guard_load_no_opencv(module: str) -> None:
     code = f"import sys, {module}; sys.exit('cv2' in sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False)
     assert run.returncode == 0, run.stderr
 
 
+@pytest.mark.parametrize(
+    "module", ["graderd.runtime.app.guard", "graderd.runtime.app.daemon", "graderd.simulator.process"]
+)
+@pytest.mark.live
+def test_no_process_loads_what_only_mf4_logs_need(module: str) -> None:
+    assert importlib.util.find_spec("asammdf"), "else it proves nothing"
+    code = f"import sys, {module}; sys.exit('asammdf' in sys.modules or 'pandas' in sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False)
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.live
 def test_stop_does_not_wait_for_large_imports() -> None:
     code = (
         "import sys, graderd.cli.app as app; app.run_app(['--socket', 'none', 'stop']);"

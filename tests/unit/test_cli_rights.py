@@ -113,6 +113,7 @@ def test_the_configured_socket_comes_first(tmp_path: Path, monkeypatch: pytest.M
     assert client.default_socket() == places.SOCKET
 
 
+@pytest.mark.live
 def test_stop_loads_nothing_heavy_to_find_its_socket() -> None:
     code = "import sys, graderd.client as c; c.default_socket(); "
     code += "print([m for m in ('pydantic', 'numpy', 'tomlkit', 'graderd.config') if m in sys.modules])"

@@ -19,6 +19,8 @@ from graderd.core.machine import ARMED, Inputs, Lease, MachineSettings, Mode, St
 from graderd.core.rule import Decision, RuleSettings
 from graderd.core.soil import SoilObservation, Zone
 
+pytestmark = pytest.mark.xdist_group("core machine model")  # the reachable states are found once
+
 TICK_S = 0.1
 SETTINGS = MachineSettings(arm_timeout_s=0.25, lease_s=0.15)
 RULE = RuleSettings(

@@ -62,6 +62,7 @@ def fields(datagram: bytes) -> dict[str, str]:
     ("level", "priority"),
     [(logging.DEBUG, "7"), (logging.INFO, "6"), (logging.WARNING, "4"), (logging.ERROR, "3"), (logging.CRITICAL, "2")],
 )
+@pytest.mark.live
 def test_the_journal_gets_priority_and_fields(tmp_path: Path, level: int, priority: str) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
         listener.bind(str(tmp_path / "journal"))
@@ -86,6 +87,7 @@ def test_a_traceback_stays_one_entry() -> None:
     assert got["PRIORITY"] == "3"
 
 
+@pytest.mark.live
 def test_what_the_journal_does_not_take_is_written_all_the_same(tmp_path: Path) -> None:
     kept: list[str] = []
 
@@ -124,10 +126,12 @@ def logged(code: str, *, in_journal: bool, address: Path) -> str:
 WARN = 'logging.getLogger("graderd.x").warning("a\\nb", extra={"device": "can"})'
 
 
+@pytest.mark.live
 def test_in_the_journal_without_its_socket_each_line_carries_its_priority(tmp_path: Path) -> None:
     assert logged(WARN, in_journal=True, address=tmp_path / "none") == "<4>a\\nb\n"
 
 
+@pytest.mark.live
 def test_in_the_journal_entries_go_to_its_socket(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
         listener.bind(str(tmp_path / "journal"))
@@ -135,6 +139,7 @@ def test_in_the_journal_entries_go_to_its_socket(tmp_path: Path) -> None:
         assert fields(listener.recv(65536))["GRADERD_DEVICE"] == "can"
 
 
+@pytest.mark.live
 def test_elsewhere_a_line_carries_the_time_and_no_priority(tmp_path: Path) -> None:
     printed = logged(WARN, in_journal=False, address=tmp_path / "none")
     assert printed.endswith(" WARNING a\\nb\n")
@@ -179,6 +184,7 @@ somewhere_deep()
         ("import os, signal; os.kill(os.getpid(), signal.SIGABRT)", "Fatal Python error: Aborted"),
     ],
 )
+@pytest.mark.live
 def test_where_the_loop_hangs_is_told(hang: str, said: str) -> None:
     done = subprocess.run(
         [sys.executable, "-c", HANGING.format(hang=hang)], capture_output=True, text=True, timeout=60, check=False

@@ -81,6 +81,7 @@ def test_a_state_directory_that_stalls_is_not_waited_for_and_told(tmp_path: Path
     assert last.reason == "four"
 
 
+@pytest.mark.live
 def test_systemd_is_told_ready_status_watchdog_and_stopping(tmp_path: Path) -> None:
     path = tmp_path / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:

@@ -13,7 +13,6 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-import can
 import cantools.database
 import j1939
 import pytest
@@ -21,6 +20,7 @@ import pytest
 import graderd.firmware_profiles
 from graderd.drivers.electrak import CanLink, ElectrakActuator, safe_off
 from graderd.drivers.j1939.ids import Pgn
+from graderd.drivers.j1939.python_can import can
 from graderd.drivers.j1939.transport import Message
 from graderd.hal.errors import DeviceMissingError
 from graderd.hal.settings import CanSettings, ElectrakSettings
