@@ -1,7 +1,7 @@
 """The lifts through the whole tick, in virtual time: ``python -m benchmarks.lift_pair [--moves N] [--losses N]``.
 
 Moves of 5 to 250 mm, with equal sides and with one side 10 to 40 % slower, without mishap, with a side that sticks for
-up to 0.4 s, and with two lost feedbacks in a row; then sides lost at full speed. See ``tests/lift_sim.py``.
+up to 0.4 s, and with two lost feedbacks in a row; then sides lost at full speed. See ``harness/lift_sim.py``.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import argparse
 import statistics
 import sys
 
-from tests.electrak_sim import run_simulated
-from tests.lift_sim import Loss, Move, lose_a_side, run_trial, trials
+from harness.electrak_sim import run_simulated
+from harness.lift_sim import Loss, Move, lose_a_side, run_trial, trials
 
 HITCHES = {"": 3.0, "sticks": 6.0, "deaf": 6.0}
 """What befalls a side, and how far apart the sides may come."""

@@ -37,16 +37,16 @@ class RuleSettings(Settings):
     dwell_s: NotNegative = Field(2.0, le=60, description="least time between two decisions")
     switch_share: float = Field(0.7, ge=0, le=1, description="share of soil a third needs to overturn a decision")
     standing_m_per_s: Positive = Field(
-        0.03, description="slower counts as standing; wheel speed reads to 0.001 m/s and few senders below 0.02"
+        0.03, le=0.2, description="slower counts as standing; wheel speed reads to 0.001 m/s and few senders below 0.02"
     )
     standing_s: NotNegative = Field(
-        0.5, description="standing so long ends the pass; a wheel that slips or a gear change ends none"
+        0.5, le=10, description="standing so long ends the pass; a wheel that slips or a gear change ends none"
     )
     pass_m: Positive = Field(
-        10.0, description="a pass ends after so much travel: another 8 m bed begins, or the site goes on and on"
+        10.0, le=200, description="a pass ends after so much travel: another 8 m bed begins, or the site goes on and on"
     )
     pass_s: Positive = Field(
-        32.0, description="without speed or travel, after so much time: 8 m at 0.25 m/s, the slowest work"
+        32.0, le=600, description="without speed or travel, after so much time: 8 m at 0.25 m/s, the slowest work"
     )
 
     @model_validator(mode="after")

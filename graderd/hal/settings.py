@@ -313,7 +313,7 @@ class VehicleSettings(Settings):
         None, ge=0, le=253, description="j1939: believe this address alone; none: whichever sends it, one at a time"
     )
     path: str = Field("", description="simulated: the rig's control socket")
-    max_age_s: Positive = Field(0.5, description="an older speed counts as unknown; J1939 sends it every 0.1 s")
+    max_age_s: Positive = Field(0.5, le=5, description="an older speed counts as unknown; J1939 sends it every 0.1 s")
 
 
 class CameraSettings(Settings):

@@ -28,8 +28,8 @@ from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from harness.awake_clock import AwakeClock
+from harness.electrak_sim import until
 from tests.contract.conformance import ActuatorStand, LinearActuatorConformance, state
-from tests.electrak_sim import until
 
 VCAN = next((path.name for path in sorted(Path("/sys/class/net").glob("vcan*"))), None)
 WIRES = ["in_process", "python_can_virtual", "slcan_pty", *([VCAN] if VCAN else [])]

@@ -8,6 +8,7 @@ import pytest
 
 from graderd.hal.clock import Clock, ManualClock, SystemClock
 from harness.awake_clock import AwakeClock
+from harness.fakes import FakeActuator, FakeRotator
 from tests.contract.conformance import (
     ActuatorStand,
     ClockConformance,
@@ -15,7 +16,6 @@ from tests.contract.conformance import (
     RotatorConformance,
     RotatorStand,
 )
-from tests.fakes import FakeActuator, FakeRotator
 
 
 class FakeRotatorStand(RotatorStand):

@@ -24,7 +24,7 @@ from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from graderd.simulator.actuators.slcan import SlcanAdapter
-from tests.electrak_sim import conditions, state, until
+from harness.electrak_sim import conditions, state, until
 
 # -- the slcan adapter, in real time ----------------------------------------------------------------------------------
 

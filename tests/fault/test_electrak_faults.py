@@ -16,7 +16,7 @@ from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CanSettings
 from graderd.simulator.actuators import VirtualElectrak
-from tests.electrak_sim import Machine, SimulatedLoop, run_simulated
+from harness.electrak_sim import Machine, SimulatedLoop, run_simulated
 
 LEFT = ("lift_left",)
 

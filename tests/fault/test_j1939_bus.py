@@ -11,7 +11,7 @@ import pytest
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CanSettings
-from tests.electrak_sim import Machine, SimulatedLoop, conditions, run_simulated, state
+from harness.electrak_sim import Machine, SimulatedLoop, conditions, run_simulated, state
 
 OURS = 231
 

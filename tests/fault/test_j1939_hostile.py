@@ -19,7 +19,7 @@ from graderd.drivers.j1939.can_port import BusPort, PortFullError
 from graderd.drivers.j1939.ids import GLOBAL, NULL, Frame, Pgn, destination_of, make_id, pgn_of, source_of
 from graderd.hal.errors import DeviceError
 from graderd.hal.lifecycle import Lifecycle
-from tests.electrak_sim import Machine, SimulatedLoop, run_simulated, state
+from harness.electrak_sim import Machine, SimulatedLoop, run_simulated, state
 
 OURS = 231
 BEYOND_MM = 3.0

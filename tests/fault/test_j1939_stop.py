@@ -11,7 +11,7 @@ from graderd.drivers.j1939.bus_health import BusEvent
 from graderd.drivers.j1939.can_port import PortFullError
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
 from graderd.hal.errors import DeviceRefusedError
-from tests.electrak_sim import Machine, SimulatedLoop, conditions, run_simulated
+from harness.electrak_sim import Machine, SimulatedLoop, conditions, run_simulated
 
 OURS = 231
 WINNER = bytes(8)

@@ -13,8 +13,8 @@ from graderd.core.machine import Mode
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
 from graderd.runtime.state_file import StateFile
+from harness.fakes import FakeActuator, FakeEyes, FakeLink
 from tests.dynamixel_sim import bench, until
-from tests.fakes import FakeActuator, FakeEyes, FakeLink
 
 JAM_S = 2.0
 """Longer than the servo's own profile takes to follow a goal that comes back (0.4 s of braking, then the way)."""

@@ -20,7 +20,7 @@ from graderd.core.machine import Mode
 from graderd.core.soil import SoilObservation, Zone
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.state_file import StateFile
-from tests.fakes import FakeMachine
+from harness.fakes import FakeMachine
 
 TICK_S = 0.02
 FRAME_EVERY_N = 3

@@ -64,7 +64,7 @@ async def test_a_bus_that_is_not_there_is_refused_with_those_that_are(tmp_path: 
 
 
 async def test_a_slow_client_gets_no_old_statuses_and_makes_nothing_grow(tmp_path: Path) -> None:
-    async with serving(tmp_path, limits=ApiLimits(stream_max_hz=1000.0)) as (daemon, path):
+    async with serving(tmp_path, limits=ApiLimits(stream_max_hz=200.0)) as (daemon, path):
         reader, writer = await asyncio.open_unix_connection(str(path), limit=4096)
         writer.write(
             b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
@@ -125,7 +125,7 @@ async def test_the_lease_is_given_back_when_the_client_goes(tmp_path: Path, how:
 
 
 async def test_the_lease_of_a_preset_is_given_back_when_the_client_goes(tmp_path: Path) -> None:
-    async with serving(tmp_path, FakeDaemon(settings=MachineSettings(lease_s=60.0))) as (daemon, path):
+    async with serving(tmp_path, FakeDaemon(settings=MachineSettings(lease_s=5.0))) as (daemon, path):
         await armed(daemon)
         socket = await connect(path, "/v1/jog")
         assert (await ask(socket, command="preset", name="transport"))["accepted"]

@@ -30,7 +30,7 @@ from graderd.runtime.app import backends, guard
 from graderd.runtime.app.devices import build_devices
 from graderd.runtime.app.frame_sources import open_camera
 from graderd.runtime.perception_protocol import Start
-from tests.fakes import FakeActuator
+from harness.fakes import FakeActuator
 
 
 def test_every_name_that_the_settings_take_has_a_driver() -> None:

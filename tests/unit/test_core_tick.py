@@ -37,7 +37,7 @@ from graderd.hal.rotator import RotatorTelemetry
 from graderd.hal.vehicle import VehicleTelemetry
 from graderd.runtime.control import ControlLoop, tick_settings
 from graderd.runtime.state_file import StateFile
-from tests.fakes import FakeMachine
+from harness.fakes import FakeMachine
 
 GOLDEN = Path(__file__).parent / "golden" / "tick.json"
 RECORDED = TypeAdapter(list[Sensed])

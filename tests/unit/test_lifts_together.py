@@ -11,8 +11,8 @@ import os
 import pytest
 
 from graderd.core import commands as cmd
-from tests.electrak_sim import SimulatedLoop, run_simulated
-from tests.lift_sim import Move, lift_machine, lose_a_side, run_trial, trials
+from harness.electrak_sim import SimulatedLoop, run_simulated
+from harness.lift_sim import Move, lift_machine, lose_a_side, run_trial, trials
 
 MOVES_N = int(os.environ.get("GRADERD_LIFT_MOVES", "30"))
 

@@ -21,7 +21,7 @@ from graderd.hal.lifecycle import Lifecycle
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.control import log as control_log
 from graderd.runtime.state_file import StateFile
-from tests.fakes import FakeMachine
+from harness.fakes import FakeMachine
 
 TICK_S = 0.02
 

@@ -222,6 +222,7 @@ def test_the_level_is_of_our_own_entries_and_libraries_stay_quiet(
     for name, prefix in (("graderd.x", ""), ("numexpr", "library ")):
         for at in (logging.DEBUG, logging.INFO, logging.WARNING, logging.ERROR):
             logging.getLogger(name).log(at, "%s%s", prefix, logging.getLevelName(at)[0].lower())
+    logging.getLogger().handlers[0].close()  # waits for its thread
     assert [json.loads(line)["message"] for line in capsys.readouterr().err.splitlines()] == told
 
 

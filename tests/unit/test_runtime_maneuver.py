@@ -22,7 +22,7 @@ from graderd.runtime.maneuver import Maneuver
 from graderd.runtime.port import Port
 from graderd.runtime.state_file import StateFile
 from harness.awake_clock import AwakeClock
-from tests.fakes import FakeMachine
+from harness.fakes import FakeMachine
 
 
 @asynccontextmanager

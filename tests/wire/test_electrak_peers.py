@@ -25,7 +25,7 @@ from graderd.drivers.j1939.transport import Message
 from graderd.hal.errors import DeviceMissingError
 from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
-from tests.electrak_sim import until
+from harness.electrak_sim import until
 
 DBC = Path(next(iter(graderd.firmware_profiles.__path__))) / "electrak_hd.dbc"
 

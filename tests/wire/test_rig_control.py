@@ -15,7 +15,7 @@ import pytest
 from graderd.hal.errors import DeviceLostError, DeviceMissingError, DeviceRefusedError
 from graderd.simulator.control_client import RigControl, rig_request
 from graderd.simulator.process import Rig
-from tests.electrak_sim import until
+from harness.electrak_sim import until
 
 READY_S = 30.0
 

@@ -20,7 +20,7 @@ from graderd.hal.vehicle import VehicleTelemetry
 from graderd.runtime.app.sim import attach
 from graderd.simulator.control_client import RigControl
 from graderd.simulator.process import Rig
-from tests.electrak_sim import until
+from harness.electrak_sim import until
 
 READY_S = 30.0
 CCVS = 0xFEF1

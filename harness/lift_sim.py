@@ -22,8 +22,8 @@ from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
 from graderd.runtime.state_file import StateFile
 from graderd.simulator.actuators import VirtualElectrak
-from tests.electrak_sim import Machine, SimulatedLoop
-from tests.fakes import FakeActuator, FakeEyes, FakeRotator
+from harness.electrak_sim import Machine, SimulatedLoop
+from harness.fakes import FakeActuator, FakeEyes, FakeRotator
 
 CONTROL_PERIOD_S: Final = 0.1
 """Of the control messages on the bus."""
