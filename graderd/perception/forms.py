@@ -1,0 +1,141 @@
+"""Soil by its form: what in a height map is a heap of soil, and what is a leg, a plant, a pipe or a stone.
+
+Soil falls at its angle of repose, so that the points in one cell of the map lie close together in height, and cells
+beside each other differ little. What stands or is rough does not: a steep cell is no soil. A lump (a connected piece
+of the map that stands out of the ground) of which hardly anything lies clear of steep cells is a thing as a whole;
+one with a large smooth core is soil, with something on it or across it. This is no detector of people: it tells form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from graderd.perception.geometry import F32, F64
+from graderd.perception.settings import FormSettings
+
+Bools = npt.NDArray[np.bool_]
+
+UNSEEN = 10.0
+"""Stands for a height that is not known, metres."""
+STEEP_TOLERANCE_M = 0.02
+CELL_M = 0.04
+"""Ground plan of the columns in which something standing is looked for."""
+LEVEL_M = 0.04
+"""Their levels: soil at 60 degrees crosses three of them within a column's diagonal, a leg all."""
+LEVELS_N = 4
+LEVEL_POINTS_N = 2
+"""Points in a level: a single one may be a wrong match."""
+LOWEST_M = 0.04
+LOW_STARTS_N = 3
+"""It must begin below 16 cm: what hangs from above (hoses, the machine's arms) does not stand."""
+HIGHEST_M = 0.40
+STANDING_FROM_M = 0.06
+"""Nearer to the face than this, the face itself may show."""
+STANDING_COLUMNS_N = 2
+TALL_M = 0.03
+"""Cells lower than this say nothing about form: their steepness drowns in noise."""
+BESIDE_CELLS_N = 2
+"""Cells so near to a steep one are not clear of it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forms:
+    """Masks over the height map: ``soil`` that stands out of the ground; of it ``doubtful`` what lies beside something
+    steep; ``things`` that are no soil; ``weak``: higher than the ground's unevenness, but not enough to tell."""
+
+    soil: Bools
+    doubtful: Bools
+    things: Bools
+    weak: Bools
+
+
+def sort_out(
+    height: F64, filled: F64, seen: Bools, steep: Bools, residual_m: float, stands_out_m: float, settings: FormSettings
+) -> Forms:
+    """Sort a height map into soil, things and ground.
+
+    ``height`` of the ``seen`` cells, ``filled``: the same without the steep cells, and with what is hidden guessed.
+    ``stands_out_m``: what soil must rise above the ground somewhere.
+    """
+    surface = np.where(seen, height, filled)
+    low_m = max(settings.lowest_m, 2.0 * residual_m)
+    count, labels = cv2.connectedComponents((surface > low_m).astype(np.uint8), connectivity=4)
+    size = 2 * BESIDE_CELLS_N + 1
+    beside = cv2.dilate((steep & seen).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    tall = seen & (height > TALL_M)
+    flat = labels.ravel()
+    tall_n = np.bincount(flat, weights=tall.ravel(), minlength=count)
+    core_n = np.bincount(flat, weights=(tall & ~beside).ravel(), minlength=count)
+    steep_n = np.bincount(flat, weights=(tall & steep).ravel(), minlength=count)
+    core = np.divide(core_n, tall_n, out=np.ones(count), where=tall_n > 0)
+    is_thing = (core * 100.0 < settings.thing_core_percent) & (steep_n > 0)
+    smooth = cv2.blur(filled, (3, 3))
+    peak = np.zeros(count)
+    np.maximum.at(peak, flat, smooth.ravel())
+    is_thing[0] = False
+    stands = (peak > stands_out_m) & ~is_thing
+    stands[0] = False
+    weak = ~stands & ~is_thing
+    weak[0] = False
+    soil, things = stands[labels], is_thing[labels]
+    # A heap's foot runs out below the level at which lumps are told apart: two cells more, up and down alike.
+    foot = cv2.dilate(soil.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    soil = foot & ~things & ~weak[labels]
+    return Forms(soil, soil & beside, things, weak[labels])
+
+
+def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[float, float] | None:
+    """Where something stands upright before the face (s, d in m); None where nothing does."""
+    inside = np.flatnonzero(
+        (z > LOWEST_M) & (z < HIGHEST_M) & (d > STANDING_FROM_M) & (d < reach_m) & (np.abs(s) < half_m)
+    )
+    if inside.size < STANDING_COLUMNS_N * LEVELS_N * LEVEL_POINTS_N:
+        return None
+    columns_n, rows_n = int(2 * half_m / CELL_M) + 1, int(reach_m / CELL_M) + 1
+    levels_n = round((HIGHEST_M - LOWEST_M) / LEVEL_M) + 1
+    i = ((s[inside] + np.float32(half_m)) * np.float32(1 / CELL_M)).astype(np.int32)
+    j = (d[inside] * np.float32(1 / CELL_M)).astype(np.int32)
+    k = ((z[inside] - np.float32(LOWEST_M)) * np.float32(1 / LEVEL_M)).astype(np.int32)
+    counts = np.bincount((i * rows_n + j) * levels_n + k, minlength=columns_n * rows_n * levels_n)
+    there = counts.reshape(columns_n, rows_n, levels_n) >= LEVEL_POINTS_N
+    runs = there[:, :, :LOW_STARTS_N].copy()
+    for level in range(1, LEVELS_N):
+        runs &= there[:, :, level : level + LOW_STARTS_N]
+    at_s, at_d = np.nonzero(runs.any(axis=2))
+    if at_s.size < STANDING_COLUMNS_N:
+        return None
+    return float(np.median(at_s) + 0.5) * CELL_M - half_m, float(np.median(at_d) + 0.5) * CELL_M
+
+
+def without_steep(height: F64, seen: Bools, rise_per_cell: float) -> Bools:
+    """Which seen cells are ground or soil: hoses, rods and legs rise steeper out of what is seen beside them."""
+    bound = _lower_cones(np.where(seen, height, UNSEEN), rise_per_cell, rise_per_cell)
+    return np.asarray(seen & (height <= bound + STEEP_TOLERANCE_M))
+
+
+def fill_hidden(height: F64, seen: Bools, drop_per_cell: float, aside_per_cell: float) -> F64:
+    """Heights with the unseen cells filled from what is seen on any side: the least that can lie behind a crest.
+
+    They fall by ``drop_per_cell`` each cell along d, at the angle of repose, and by the steeper ``aside_per_cell``
+    along the blade: what a heap hides of the third beside it must not be filled up with a heap of guesses.
+    """
+    least = -_lower_cones(np.where(seen, -height, UNSEEN), aside_per_cell, drop_per_cell)
+    return np.where(seen, height, np.maximum(least, 0.0))
+
+
+def _lower_cones(height: F64, rise_s_per_cell: float, rise_d_per_cell: float) -> F64:
+    """The lower envelope of upward cones standing on every cell, of these slopes along s and d.
+
+    Distances run along the two directions of the cells, so that four accumulations give it.
+    """
+    for axis, rise_per_cell in enumerate((rise_s_per_cell, rise_d_per_cell)):
+        steps = rise_per_cell * np.arange(height.shape[axis])
+        steps = steps[:, None] if axis == 0 else steps[None, :]
+        up = np.minimum.accumulate(height - steps, axis=axis) + steps
+        down = np.flip(np.minimum.accumulate(np.flip(height + steps, axis), axis=axis), axis) - steps
+        height = np.minimum(up, down)
+    return height
