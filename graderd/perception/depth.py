@@ -239,7 +239,11 @@ class DepthJudge:
         upright = spread.reshape(shape) > np.hypot(form.steep_spread_m, ground.residual_m)
         smooth = without_steep(height, seen, float(slope[0]))
         steep = seen & (upright | ~smooth)
-        filled = fill_hidden(height, smooth & ~upright, float(slope[1]), float(slope[0]))
+        good = smooth & ~upright
+        # What touches the face hides in the face's own margin: soil goes on to it as high as it is just before.
+        touching = good[:, 1] & ~good[:, 0]
+        height[touching, 0], good[touching, 0] = height[touching, 1], True
+        filled = fill_hidden(height, good, float(slope[1]), float(slope[0]))
         threshold = max(settings.min_height_m, settings.noise_factor_ratio * ground.residual_m)
         forms = sort_out(height, filled, seen, steep, ground.residual_m, threshold, form)
         taken = slice(0, self._ahead_n)

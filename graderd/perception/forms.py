@@ -82,10 +82,11 @@ def sort_out(
     weak = ~stands & ~is_thing
     weak[0] = False
     soil, things = stands[labels], is_thing[labels]
-    # A heap's foot runs out below the level at which lumps are told apart: two cells more, up and down alike.
-    foot = cv2.dilate(soil.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    # A heap's foot runs out below the level at which lumps are told apart: three cells more, up and down alike.
+    foot = cv2.dilate(soil.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     soil = foot & ~things & ~weak[labels]
-    return Forms(soil, soil & beside, things, weak[labels])
+    touched = cv2.dilate((steep & seen).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return Forms(soil, soil & touched, things, weak[labels])
 
 
 def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[float, float] | None:

@@ -28,7 +28,7 @@ INLIER_M = 0.010
 HYPOTHESES_N = 64
 """Planes through three cells; with half of the cells on the ground, a few of them have all three there."""
 VOTERS_N = 100
-NEAR_M = 1.0
+NEAR_M = 0.8
 """Ground within this of the blade's middle shapes the surface; what lies further tells nothing about the zone."""
 SURFACE_BAND_M = 0.06
 """Cells further than this from the plane are soil or things, not unevenness."""
@@ -130,9 +130,10 @@ class GroundFit:
         zone = (np.abs(s) < half) & (d > -CLEAR_M) & (d < reach)
         far = np.hypot(cx, cy) > NEAR_M
         off = _about(plane, cx, cy, cz)
-        ring = ~zone & ~far & (np.abs(off) < SURFACE_BAND_M)
+        ground = ~zone & (np.abs(off) < SURFACE_BAND_M) & (spread < CELL_FLAT_M)
+        ring = ground & ~far
         if ring.sum() < MIN_RING_N:
-            ring = ~zone & (np.abs(off) < SURFACE_BAND_M)
+            ring = ground
         if ring.sum() < MIN_RING_N:
             return replace(plane, residual_m=float(np.median(spread)))
         x, y, rest = cx[ring], cy[ring], off[ring]

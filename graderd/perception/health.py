@@ -179,7 +179,7 @@ class HealthMonitor:
             up_m = soil.edge.height_m - stance.edge_m(self._blade) - stance.tall_m(self._blade)
             tilted_deg = float(np.degrees(soil.edge.rise - stance.rise))
             said = f"edge {up_m * 1000:+.0f} mm up, tilted by {tilted_deg:+.1f} deg"
-            off = abs(up_m) > settings.knocked_axis_mm / 1000 or abs(tilted_deg) > settings.knocked_deg / 2
+            off = abs(up_m) > settings.knocked_ground_mm / 1000 or abs(tilted_deg) > settings.knocked_deg / 2
             if not level and off and abs(offset_m - up_m) < settings.knocked_axis_mm / 1000:
                 moved.append(f"{said}, and the ground with it (tilted by {ground.slope_deg():.1f} deg)")
             elif stance.attitude.height_mm is not None and abs(up_m) > settings.knocked_mm / 1000:
