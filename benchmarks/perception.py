@@ -55,14 +55,15 @@ def measure(frames: FrameSet) -> tuple[dict[Method, Score], dict[str, list[float
     same = 0
     into: np.ndarray | None = None
     for entry, frame in frames.frames():
+        stance = (entry.blade_angle_deg, 0.0, entry.attitude)
         if into is None:
             into = np.empty_like(frame.color_bgr)
             for classifier in classifiers.values():
-                classifier.classify(frame, entry.blade_angle_deg, 0.0)  # tables are built with the first frame
+                classifier.classify(frame, *stance)  # tables are built with the first frame
         times["copy"].append(copy_ms(frame.color_bgr, into))
         answers = {}
         for method, classifier in classifiers.items():
-            observations = [classifier.classify(frame, entry.blade_angle_deg, 0.0) for _ in range(REPEATS_N)]
+            observations = [classifier.classify(frame, *stance) for _ in range(REPEATS_N)]
             observation = observations[-1]
             times[method].append(min(observation.cpu_ms for observation in observations))
             ambiguous = entry.extra.get("ambiguous", "") == "true"

@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from graderd.core.attitude import MeasuredAttitude
+from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import PictureFault, SoilObservation, Zone
 from graderd.hal.camera import Frame, Intrinsics
@@ -45,7 +45,7 @@ class Classifier(Protocol):
         frame: Frame,
         blade_angle_deg: float,
         blade_angle_age_s: float,
-        attitude: MeasuredAttitude = MeasuredAttitude(),
+        attitude: MeasuredAttitude = UNMEASURED,
     ) -> SoilObservation:
         """Judge one frame with the thirds laid at ``blade_angle_deg``, measured ``blade_angle_age_s`` before capture.
 
@@ -92,7 +92,7 @@ class SoilClassifier:
         frame: Frame,
         blade_angle_deg: float,
         blade_angle_age_s: float,
-        attitude: MeasuredAttitude = MeasuredAttitude(),
+        attitude: MeasuredAttitude = UNMEASURED,
     ) -> SoilObservation:
         """See :class:`Classifier`."""
         start_s = time.thread_time()
@@ -283,7 +283,7 @@ def judge_frame(
     blade_angle_age_s: float,
     now_s: float,
     settings: DecisionSettings,
-    attitude: MeasuredAttitude = MeasuredAttitude(),
+    attitude: MeasuredAttitude = UNMEASURED,
 ) -> SoilObservation:
     """The observation of one frame, with an old one never judged.
 

@@ -49,10 +49,10 @@ FACE_MARGIN_M = 0.025
 class HeightMap:
     """Soil in blade coordinates: ``height_m[i, j]`` at s cell i (right to left) and d cell j (blade to front).
 
-    ``seen`` is False where the height was filled in. Triples are per third: right, center, left. ``valid``: share of the
-    pixels on it that measure it, neither without depth nor hidden by something nearer. ``doubtful_l``: what of
-    ``volumes_l`` lies beside something that is no soil. ``things_l``, ``weak_l``: what else rises there, and is no soil or
-    does not stand out of the uneven ground. ``standing_at_m``: s and d of something that stands upright.
+    ``seen`` is False where the height was filled in. Triples are per third: right, center, left. ``valid``: share of
+    the pixels on it that measure it, neither without depth nor hidden by something nearer. ``doubtful_l``: what of
+    ``volumes_l`` lies beside something that is no soil. ``things_l``, ``weak_l``: what else rises there, and is no
+    soil or does not stand out of the uneven ground. ``standing_at_m``: s and d of something that stands upright.
     ``cut_m``: how far the edge is under what looks like ground, where no measured lift says why.
     """
 
@@ -141,7 +141,8 @@ class DepthJudge:
     def _above_edge(self, s: F32, z: F32, raw_z: F32, edge: UpperEdge | None, stance: Stance) -> F32:
         """Heights above the cutting edge: below the upper edge where it was found, else as the lifts say."""
         if edge is None:
-            return np.asarray(z - np.float32(stance.edge_m(self._blade)) - np.float32(stance.rise) * s, dtype=np.float32)
+            bottom = np.float32(stance.edge_m(self._blade))
+            return np.asarray(z - bottom - np.float32(stance.rise) * s, dtype=np.float32)
         bottom = np.float32(edge.height_m - stance.tall_m(self._blade))
         return np.asarray(raw_z - bottom - np.float32(edge.rise) * s, dtype=np.float32)
 

@@ -67,7 +67,7 @@ def sort_out(
     size = 2 * BESIDE_CELLS_N + 1
     beside = cv2.dilate((steep & seen).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
     tall = seen & (height > TALL_M)
-    flat = labels.ravel()
+    flat = np.asarray(labels.ravel(), dtype=np.intp)
     tall_n = np.bincount(flat, weights=tall.ravel(), minlength=count)
     core_n = np.bincount(flat, weights=(tall & ~beside).ravel(), minlength=count)
     steep_n = np.bincount(flat, weights=(tall & steep).ravel(), minlength=count)

@@ -138,12 +138,12 @@ class GroundFit:
             return replace(plane, residual_m=float(np.median(spread)))
         x, y, rest = cx[ring], cy[ring], off[ring]
         a = np.column_stack((np.ones_like(x), x, y, x * x, x * y, y * y))
-        bend = np.zeros(6)
+        bend: F64 = np.zeros(6)
         prior = np.diag((0.02, 0.05, 0.05, *[(SURFACE_SIGMA_M / CURVATURE_SIGMA_PER_M) ** 2] * 3))
         for _ in range(4):
             weight = 1.0 / (1.0 + ((rest - a @ bend) / SURFACE_SIGMA_M) ** 2)
             weighed = a * weight[:, None]
-            bend = np.linalg.solve(a.T @ weighed + prior, weighed.T @ rest)
+            bend = np.asarray(np.linalg.solve(a.T @ weighed + prior, weighed.T @ rest), dtype=np.float64)
         uneven = 1.4826 * float(np.median(np.abs(rest - a @ bend)))
         return replace(
             plane,

@@ -162,7 +162,8 @@ class HealthMonitor:
         """
         settings, fix, ground = self._settings, soil.blade, soil.ground
         axis_m = float(np.hypot(fix.ahead_m, fix.along_m))
-        moved, elsewhere = [], []
+        moved: list[str] = []
+        elsewhere: list[str] = []
         if max(abs(fix.ahead_m), abs(fix.along_m)) > settings.knocked_mm / 1000:
             moved.append(f"blade {fix.ahead_m * 1000:+.0f} mm ahead, {fix.along_m * 1000:+.0f} mm along")
         if abs(fix.turn_deg) > settings.knocked_deg:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from graderd.core.attitude import MeasuredAttitude
+from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.hal.camera import DepthImage
 from graderd.perception.geometry import F32, F64, View, blade_points_m, face_setback_m
@@ -46,7 +46,7 @@ class Stance:
     """
 
     angle_deg: float
-    attitude: MeasuredAttitude = MeasuredAttitude()
+    attitude: MeasuredAttitude = UNMEASURED
 
     def edge_m(self, blade: BladeGeometry) -> float:
         """Height of the cutting edge's middle over the calibrated ground."""
@@ -81,7 +81,8 @@ class Stance:
 
 @dataclass(frozen=True, slots=True)
 class UpperEdge:
-    """The blade's upper edge as found: calibrated height at its middle and rise along s, and height above the ground."""
+    """The blade's upper edge as found: height at its middle and rise along s in the calibrated frame, and height above
+    the ground."""
 
     height_m: float
     rise: float

@@ -105,12 +105,14 @@ class DepthSettings(Settings):
     min_height_m: Positive = Field(default=0.012, description="and by at least this")
     max_height_m: Positive = Field(default=0.34, description="what is higher than this is no part of a heap")
     repose_deg: Annotated[float, Field(gt=0, lt=80)] = Field(
-        default=33.0, description="slope given to hidden back faces"
+        default=30.0, description="slope given to hidden back faces"
     )
     ground_offset_limit_m: Positive = Field(
-        default=0.055, description="ground is looked for within half as much again above and below the calibrated one"
+        default=0.055, description="ground is looked for so far above and below the calibrated one"
     )
-    ground_slope_limit_deg: Positive = Field(default=8.0, description="ground tilted more than this is not judged (14 %)")
+    ground_slope_limit_deg: Positive = Field(
+        default=8.0, description="ground tilted more than this is not judged (14 %)"
+    )
     form: FormSettings = Field(default_factory=FormSettings)
     min_valid_percent: Percent = Field(default=35.0, description="less depth than this in front of the blade: unknown")
     none_volume_l: Positive = Field(default=1.2, description="less soil than this in front of the whole blade: none")

@@ -8,8 +8,10 @@ import pytest
 from graderd.core.soil import Zone
 from graderd.hal.camera import DepthImage
 from graderd.perception import CameraCalibration, PerceptionSettings
-from graderd.perception.depth import DepthJudge, HeightMap, fill_hidden
+from graderd.perception.depth import DepthJudge, HeightMap
+from graderd.perception.forms import fill_hidden
 from graderd.perception.geometry import LEFT, RIGHT, View
+from graderd.perception.registration import Stance
 from harness.perception_scenes import PoseError, Scene, height_field, render, volumes_l
 
 SETTINGS = PerceptionSettings()
@@ -36,7 +38,7 @@ def judge_of(scene: Scene, spoil: float = 0.0) -> tuple[DepthJudge, DepthImage]:
 
 def measure(scene: Scene, spoil: float = 0.0) -> tuple[Zone, HeightMap]:
     judge, depth = judge_of(scene, spoil)
-    soil = judge.height_map(depth, scene.angle_deg)
+    soil = judge.height_map(depth, Stance(scene.angle_deg))
     return judge.verdict(soil).zone, soil
 
 
@@ -79,14 +81,14 @@ def test_half_of_the_pixels_missing_changes_nothing() -> None:
 def test_too_little_depth_on_one_third_is_unknown() -> None:
     judge, depth = judge_of(Scene(zone=Zone.LEFT, seed=1))
     depth[:, : depth.shape[1] // 2] = 0  # the machine's right
-    verdict = judge.verdict(judge.height_map(depth, 0.0))
+    verdict = judge.verdict(judge.height_map(depth, Stance(0.0)))
     assert verdict.zone is Zone.UNKNOWN
     assert "has depth" in verdict.reason
 
 
 def test_an_empty_picture_is_unknown() -> None:
     judge, depth = judge_of(Scene())
-    assert judge.verdict(judge.height_map(np.zeros_like(depth), 0.0)).zone is Zone.UNKNOWN
+    assert judge.verdict(judge.height_map(np.zeros_like(depth), Stance(0.0))).zone is Zone.UNKNOWN
 
 
 def test_more_noise_invents_no_soil() -> None:
@@ -100,7 +102,7 @@ def test_mirrored_soil_gives_mirrored_litres() -> None:
 
 def test_same_picture_same_answer() -> None:
     judge, depth = judge_of(Scene(zone=Zone.CENTER, seed=9))
-    assert judge.height_map(depth, 10.0).volumes_l == judge.height_map(depth, 10.0).volumes_l
+    assert judge.height_map(depth, Stance(10.0)).volumes_l == judge.height_map(depth, Stance(10.0)).volumes_l
 
 
 def test_hidden_cells_fall_from_the_crest() -> None:
