@@ -24,7 +24,7 @@ from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Zone
 from graderd.hal.camera import Frame, StreamPose
-from graderd.perception.calibration_evidence import ColorEvidence, DepthEvidence, collect_color, collect_depth
+from graderd.perception.calibration_evidence import TOP, ColorEvidence, DepthEvidence, collect_color, collect_depth
 from graderd.perception.depth import DepthJudge
 from graderd.perception.geometry import F64, View
 from graderd.perception.health import HealthMonitor, obstructed
@@ -42,9 +42,9 @@ BANDS_M = (0.14, 0.10, 0.07, 0.05, 0.035, 0.025, 0.02, 0.015, 0.012)
 COLOR_ONLY_BANDS_M = (0.05, 0.04, 0.03, 0.02, 0.015, 0.012, 0.012, 0.012)
 """Further away, any edge of a picture may pass for the blade's."""
 DEPTH_SIGMA_M = 0.003
-TOP_SIGMA_M = 0.015
-"""Stereo matching makes the upper edge taller by a pixel or two; the colour picture knows better where it is."""
 COLOR_SIGMA_PX = 1.0
+COLOR_TOP_SIGMA_PX = 6.0
+"""From above, the plate's thickness shows behind the upper edge: where depth tells, colour has little say there."""
 PRIOR_SIGMA = np.array([0.5, 0.5, 0.5, 30.0, 30.0, 30.0, 0.02, 0.03, 0.03, 0.1, 5.0, 15.0])
 """How far a number may plausibly be from where it starts: metres and degrees. Decides only what is not seen."""
 AS_DRAWN_SIGMA_M = 0.0005
@@ -205,13 +205,12 @@ class _Solver:
         parts: list[F64] = []
         for evidence, view in zip(self._depth, self._with_depth(), strict=True):
             depth_view = self._views_of(view.frame, calibration)[1]
-            *faces, top = evidence.residuals_m(depth_view, blade, self._stance(view, p))
-            parts += [r / DEPTH_SIGMA_M for r in faces]
-            parts.append(top / TOP_SIGMA_M)
+            parts += [r / DEPTH_SIGMA_M for r in evidence.residuals_m(depth_view, blade, self._stance(view, p))]
         colored = self._views if len(self._color) == len(self._views) else self._without_depth()
         for found, view in zip(self._color, colored, strict=True):
             color_view = self._views_of(view.frame, calibration)[0]
-            parts.append(found.residuals_px(color_view, blade, self._stance(view, p)) / COLOR_SIGMA_PX)
+            sigma = np.where((found.side == TOP) & bool(self._depth), COLOR_TOP_SIGMA_PX, COLOR_SIGMA_PX)
+            parts.append(found.residuals_px(color_view, blade, self._stance(view, p)) / sigma)
         return np.concatenate(parts)
 
     def _with_depth(self) -> list[EmptyBlade]:

@@ -144,8 +144,10 @@ def _top(
         inside = np.flatnonzero(near & (s >= low) & (s < high))
         if inside.size < 40:
             continue
+        # Half of the topmost row of pixels: the very highest are those that noise has lifted.
+        rank = max(3, round(0.25 * (high - low) / grow_m))
         order = inside[np.argsort(z[inside])]
-        found.append(points[order[-3]] + up)
+        found.append(points[order[-min(rank, inside.size)]] + up)
     return np.reshape(found, (-1, 3))
 
 

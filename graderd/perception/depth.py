@@ -20,7 +20,16 @@ from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Zone
 from graderd.hal.camera import DepthImage
 from graderd.perception.decide import Verdict, decide
-from graderd.perception.forms import Bools, fill_hidden, sort_out, standing, without_steep
+from graderd.perception.forms import (
+    HANGS_M,
+    STEEP_TOLERANCE_M,
+    Bools,
+    above_neighbours,
+    fill_hidden,
+    sort_out,
+    standing,
+    steep_cells,
+)
 from graderd.perception.geometry import F32, F64, U8, View, third_outlines_px
 from graderd.perception.ground import Ground, GroundFit
 from graderd.perception.registration import BladeFinder, BladeFix, Stance, UpperEdge
@@ -85,13 +94,18 @@ class DepthJudge:
         self._stride = max(1, round(settings.stride_px * view.lens.width / NOMINAL_WIDTH_PX))
         rays = view.rays(self._stride)
         self._rays = np.ascontiguousarray(rays.reshape(-1, 3).T)
-        self._ground = GroundFit(blade, settings.ground_offset_limit_m, settings.ground_slope_limit_deg)
+        self._ground = GroundFit(
+            blade, view.position_m, settings.ground_offset_limit_m, settings.ground_slope_limit_deg
+        )
         self._finder = BladeFinder(view, blade)
         self._along_n = max(6, 3 * round(blade.length_m / settings.cell_m / 3))
         self._ahead_n = max(4, round(blade.reach_m / settings.cell_m))
         self._cell_s_m = blade.length_m / self._along_n
         self._cell_d_m = blade.reach_m / self._ahead_n
         self._context_n = round(CONTEXT_M / self._cell_d_m)
+        half = blade.length_m / 2
+        self._cells_s_m = (np.arange(self._along_n)[:, None] + 0.5) * self._cell_s_m - half
+        self._cells_d_m = (np.arange(self._ahead_n + self._context_n)[None, :] + 0.5) * self._cell_d_m
 
     def height_map(self, depth_mm: DepthImage, stance: Stance) -> HeightMap:
         """Measure one depth picture (uint16, mm along the optical axis, 0 = no value)."""
@@ -119,7 +133,7 @@ class DepthJudge:
         wanted = np.flatnonzero(low & (d < blade.reach_m + CONTEXT_M))
         valid = self._valid_shares(pixels[wanted], angle_deg)
         in_front = wanted[(face[wanted] > np.float32(FACE_MARGIN_M)) & (d[wanted] > 0)]
-        soil = self._map(s[in_front], d[in_front], z[in_front], ground, fix, valid)
+        soil = self._map(s[in_front], d[in_front], z[in_front], ground, fix, valid, self._noise_m(ground, angle_deg))
         return replace(soil, edge=edge, standing_at_m=stands, cut_m=cut_m)
 
     def _layer(self, ground: Ground, edge: UpperEdge | None, stance: Stance) -> tuple[Ground, float]:
@@ -218,7 +232,14 @@ class DepthJudge:
                 cv2.fillPoly(grid, [np.round(places * 16).astype(np.int32)], third, shift=4)
         return grid.ravel(), tuple(int(n) for n in np.bincount(grid.ravel(), minlength=4))
 
-    def _map(self, s: F32, d: F32, z: F32, ground: Ground, fix: BladeFix, valid: Litres) -> HeightMap:
+    def _noise_m(self, ground: Ground, angle_deg: float) -> F64:
+        """The noise of heights in each cell: it grows with the square of the distance, as disparity has it."""
+        angle = np.radians(angle_deg)
+        x, y, z = self._view.position_m
+        s, d = y * np.cos(angle) - x * np.sin(angle), x * np.cos(angle) + y * np.sin(angle) - self._blade.x_offset_m
+        return ground.noise_m_per_m2 * ((self._cells_s_m - s) ** 2 + (self._cells_d_m - d) ** 2 + z**2)
+
+    def _map(self, s: F32, d: F32, z: F32, ground: Ground, fix: BladeFix, valid: Litres, noise_m: F64) -> HeightMap:
         blade, settings = self._blade, self._settings
         half = np.float32(blade.length_m / 2)
         inside = np.flatnonzero(np.abs(s) < half)
@@ -233,14 +254,15 @@ class DepthJudge:
         seen = count > 0
         n = np.maximum(count, 1)
         height = np.bincount(flat, weights=z, minlength=size) / n
-        spread = np.sqrt(np.maximum(np.bincount(flat, weights=z * z, minlength=size) / n - height**2, 0.0))
+        square = np.maximum(np.bincount(flat, weights=z * z, minlength=size) / n - height**2, 0.0) * count
         seen, height = seen.reshape(shape), height.reshape(shape)
         form = settings.form
         slope = np.tan(np.radians((form.steepest_deg, settings.repose_deg))) * self._cell_d_m
-        upright = spread.reshape(shape) > np.hypot(form.steep_spread_m, ground.residual_m)
-        smooth = without_steep(height, seen, float(slope[0]))
-        steep = seen & (upright | ~smooth)
-        good = smooth & ~upright
+        spread, hanging = steep_cells(square.reshape(shape), count.reshape(shape), noise_m, form)
+        high = above_neighbours(height, seen & ~hanging, float(slope[0]))
+        seen &= ~hanging & (high < HANGS_M)
+        steep = seen & (spread | (high > STEEP_TOLERANCE_M))
+        good = seen & ~steep
         # What touches the face hides in the face's own margin: soil goes on to it as high as it is just before.
         touching = good[:, 1] & ~good[:, 0]
         height[touching, 0], good[touching, 0] = height[touching, 1], True

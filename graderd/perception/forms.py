@@ -18,10 +18,20 @@ from graderd.perception.geometry import F32, F64
 from graderd.perception.settings import FormSettings
 
 Bools = npt.NDArray[np.bool_]
+Counts = npt.NDArray[np.intp]
 
 UNSEEN = 10.0
 """Stands for a height that is not known, metres."""
 STEEP_TOLERANCE_M = 0.02
+OWN_SPREAD_M = 0.020
+"""Heights in one cell spread by this: steep whatever its neighbours are (soil at 60 degrees: 10 mm)."""
+GAP_SPREAD_M = 0.040
+"""Points of one cell spread by this lie on two things above each other, with nothing between."""
+HANGS_M = 0.08
+"""So far above what could rise there: it hangs (a hose, an arm of the machine); what stands is found by standing()."""
+ROW_CELLS_N = 5
+SLOPE_NOISE_RATIO = 1.5
+"""Noise along the line of sight lifts points of a slope that faces the camera half as much again as those of ground."""
 CELL_M = 0.04
 """Ground plan of the columns in which something standing is looked for."""
 LEVEL_M = 0.04
@@ -89,6 +99,28 @@ def sort_out(
     return Forms(soil, soil & touched, things, weak[labels])
 
 
+def steep_cells(square_m2: F64, count: Counts, noise_m: F64, settings: FormSettings) -> tuple[Bools, Bools]:
+    """Cells whose points spread more in height than soil's do, and cells over which something hangs.
+
+    ``square_m2``: sum of the squares of their heights about their mean, over ``count`` points. A cell holds a few points
+    only, so that five in a row are judged together, along s and along d: a pipe is steep along one of them.
+    """
+    freedom = np.maximum(count - 1, 0).astype(np.float64)
+    variance = np.divide(square_m2, freedom, out=np.zeros(square_m2.shape), where=freedom > 0)
+    hanging = variance > GAP_SPREAD_M**2
+    freedom[hanging] = 0.0
+    # One cell of a hose must not make its neighbours steep.
+    capped = np.minimum(variance, OWN_SPREAD_M**2) * freedom
+    pooled = np.zeros(variance.shape)
+    for row in ((ROW_CELLS_N, 1), (1, ROW_CELLS_N)):
+        points = cv2.boxFilter(freedom, -1, row, normalize=False)
+        squares = cv2.boxFilter(capped, -1, row, normalize=False)
+        pooled = np.maximum(pooled, np.divide(squares, points, out=np.zeros(pooled.shape), where=points > 0.5))
+    limit = settings.steep_spread_m**2 + (SLOPE_NOISE_RATIO * noise_m) ** 2
+    steep = ((pooled > limit) | (variance > OWN_SPREAD_M**2 + limit)) & (freedom > 0)
+    return np.asarray(steep), np.asarray(hanging)
+
+
 def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[float, float] | None:
     """Where something stands upright before the face (s, d in m); None where nothing does."""
     inside = np.flatnonzero(
@@ -112,10 +144,9 @@ def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[flo
     return float(np.median(at_s) + 0.5) * CELL_M - half_m, float(np.median(at_d) + 0.5) * CELL_M
 
 
-def without_steep(height: F64, seen: Bools, rise_per_cell: float) -> Bools:
-    """Which seen cells are ground or soil: hoses, rods and legs rise steeper out of what is seen beside them."""
-    bound = _lower_cones(np.where(seen, height, UNSEEN), rise_per_cell, rise_per_cell)
-    return np.asarray(seen & (height <= bound + STEEP_TOLERANCE_M))
+def above_neighbours(height: F64, seen: Bools, rise_per_cell: float) -> F64:
+    """How far cells stand above what could rise out of what is seen beside them at this slope (m)."""
+    return np.asarray(height - _lower_cones(np.where(seen, height, UNSEEN), rise_per_cell, rise_per_cell))
 
 
 def fill_hidden(height: F64, seen: Bools, drop_per_cell: float, aside_per_cell: float) -> F64:

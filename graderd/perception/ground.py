@@ -44,7 +44,8 @@ MIN_RING_N = 25
 class Ground:
     """Surface ``z = offset_m + slope_x x + slope_y y + bend_xx x^2 + bend_xy x y + bend_yy y^2``, calibrated frame.
 
-    ``residual_m``: robust rms of the heights about it, unevenness and noise together. ``support``: share of the flat
+    ``residual_m``: robust rms of the heights about it, unevenness and noise together. ``noise_m_per_m2``: the part
+    that shows between neighbouring points, over the square of their distance from the camera. ``support``: share of the flat
     cells that lie on its plane. ``cells``: how many those are; 0 where no ground was seen and the calibration is kept.
     """
 
@@ -55,6 +56,7 @@ class Ground:
     bend_xy_per_m: float = 0.0
     bend_yy_per_m: float = 0.0
     residual_m: float = 0.0
+    noise_m_per_m2: float = 0.0
     support: float = 0.0
     cells: int = 0
 
@@ -86,7 +88,8 @@ class Ground:
 class GroundFit:
     """Fits the ground: flat cells vote on planes, then what surrounds the zone shapes the surface."""
 
-    def __init__(self, blade: BladeGeometry, offset_limit_m: float, slope_limit_deg: float) -> None:
+    def __init__(self, blade: BladeGeometry, eye_m: F64, offset_limit_m: float, slope_limit_deg: float) -> None:
+        self._eye_m = eye_m
         self._blade = blade
         self._offset_limit_m = offset_limit_m
         self._slope_limit = float(np.tan(np.radians(slope_limit_deg)))
@@ -135,7 +138,8 @@ class GroundFit:
         if ring.sum() < MIN_RING_N:
             ring = ground
         if ring.sum() < MIN_RING_N:
-            return replace(plane, residual_m=float(np.median(spread)))
+            noise = float(np.median(spread))
+            return replace(plane, residual_m=noise, noise_m_per_m2=self._per_square(noise, cx, cy))
         x, y, rest = cx[ring], cy[ring], off[ring]
         a = np.column_stack((np.ones_like(x), x, y, x * x, x * y, y * y))
         bend: F64 = np.zeros(6)
@@ -145,6 +149,7 @@ class GroundFit:
             weighed = a * weight[:, None]
             bend = np.asarray(np.linalg.solve(a.T @ weighed + prior, weighed.T @ rest), dtype=np.float64)
         uneven = 1.4826 * float(np.median(np.abs(rest - a @ bend)))
+        noise = float(np.median(spread[ring]))
         return replace(
             plane,
             offset_m=plane.offset_m + float(bend[0]),
@@ -153,8 +158,13 @@ class GroundFit:
             bend_xx_per_m=float(bend[3]),
             bend_xy_per_m=float(bend[4]),
             bend_yy_per_m=float(bend[5]),
-            residual_m=float(np.hypot(uneven, np.median(spread[ring]))),
+            residual_m=float(np.hypot(uneven, noise)),
+            noise_m_per_m2=self._per_square(noise, cx[ring], cy[ring]),
         )
+
+    def _per_square(self, noise_m: float, x: F64, y: F64) -> float:
+        eye_x, eye_y, eye_z = self._eye_m
+        return noise_m / float(np.median((x - eye_x) ** 2 + (y - eye_y) ** 2 + eye_z**2))
 
     def _cells(self, x: F32, y: F32, z: F32) -> tuple[F64, F64, F64, F64]:
         """Mean place, mean height and spread of height of the cells that hold points near the calibrated ground."""

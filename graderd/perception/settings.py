@@ -86,7 +86,7 @@ class FormSettings(Settings):
         default=60.0, description="what rises steeper out of what lies beside it is no soil"
     )
     steep_spread_m: Positive = Field(
-        default=0.0085, description="heights within a cell spread more than this: steep (soil at 45 deg: 6 mm)"
+        default=0.0105, description="heights in cells in a row spread more than this: steep (soil at 45 deg: 6 mm)"
     )
     thing_core_percent: Percent = Field(
         default=20.0, description="a lump with less than this clear of steep cells is no soil"

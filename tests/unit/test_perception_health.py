@@ -79,7 +79,17 @@ def test_a_healthy_picture_has_no_fault() -> None:
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("how", ["black", "blown_out", "blocked", "blurred", "torn", "wrong_resolution"])
 def test_faults_of_the_picture(how: str, method: Method) -> None:
-    assert named(judge(spoiled(picture(), how), method)) == [how]
+    dark = method == "depth" and how in ("black", "blown_out")
+    assert named(judge(spoiled(picture(), how), method)) == ([] if dark else [how])
+
+
+@pytest.mark.parametrize("how", ["black", "blown_out"])
+@pytest.mark.parametrize("zone", [Zone.LEFT, Zone.CENTER, Zone.NONE])
+def test_depth_needs_no_light(how: str, zone: Zone) -> None:
+    frame = picture(zone=zone)
+    unlit = judge(spoiled(frame, how), "depth")
+    assert unlit.zone is zone
+    assert unlit.volume_left_l == judge(frame, "depth").volume_left_l
 
 
 @pytest.mark.parametrize("how", ["no depth", "hardly any depth"])
