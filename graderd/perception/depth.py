@@ -22,6 +22,7 @@ from graderd.hal.camera import DepthImage
 from graderd.perception.decide import Verdict, decide
 from graderd.perception.forms import (
     HANGS_M,
+    SLOPE_NOISE_RATIO,
     STEEP_TOLERANCE_M,
     Bools,
     above_neighbours,
@@ -62,7 +63,8 @@ class HeightMap:
     the pixels on it that measure it, neither without depth nor hidden by something nearer. ``doubtful_l``: what of
     ``volumes_l`` lies beside something that is no soil. ``things_l``, ``weak_l``: what else rises there, and is no
     soil or does not stand out of the uneven ground. ``standing_at_m``: s and d of something that stands upright.
-    ``cut_m``: how far the edge is under what looks like ground, where no measured lift says why.
+    ``cut_m``: how far the edge is under what looks like ground, where no measured lift says why. ``form_is_sure``: noise
+    does not drown what tells soil from things.
     """
 
     height_m: F64
@@ -78,6 +80,7 @@ class HeightMap:
     edge: UpperEdge | None = None
     standing_at_m: tuple[float, float] | None = None
     cut_m: float = 0.0
+    form_is_sure: bool = True
 
 
 class DepthJudge:
@@ -176,6 +179,10 @@ class DepthJudge:
                 f"the edge seems to be {soil.cut_m * 1000:.0f} mm in the ground: cut ground and a level layer of soil "
                 "look the same without a measured lift that agrees"
             )
+        if verdict.zone is Zone.NONE and not soil.form_is_sure and sum(soil.things_l) > settings.none_volume_l:
+            return verdict.unknown(
+                f"{sum(soil.things_l):.1f} l lie there, and noise hides whether they have the form of soil"
+            )
         if any(soil.doubtful_l):
             sure_l = np.subtract(soil.volumes_l, soil.doubtful_l)
             right, center, left = (max(float(value), 0.0) for value in sure_l)
@@ -237,7 +244,8 @@ class DepthJudge:
         angle = np.radians(angle_deg)
         x, y, z = self._view.position_m
         s, d = y * np.cos(angle) - x * np.sin(angle), x * np.cos(angle) + y * np.sin(angle) - self._blade.x_offset_m
-        return ground.noise_m_per_m2 * ((self._cells_s_m - s) ** 2 + (self._cells_d_m - d) ** 2 + z**2)
+        square_m2 = (self._cells_s_m - s) ** 2 + (self._cells_d_m - d) ** 2 + z**2
+        return np.asarray(ground.noise_m_per_m2 * square_m2, dtype=np.float64)
 
     def _map(self, s: F32, d: F32, z: F32, ground: Ground, fix: BladeFix, valid: Litres, noise_m: F64) -> HeightMap:
         blade, settings = self._blade, self._settings
@@ -254,7 +262,7 @@ class DepthJudge:
         seen = count > 0
         n = np.maximum(count, 1)
         height = np.bincount(flat, weights=z, minlength=size) / n
-        square = np.maximum(np.bincount(flat, weights=z * z, minlength=size) / n - height**2, 0.0) * count
+        square = np.asarray(np.maximum(np.bincount(flat, weights=z * z, minlength=size) / n - height**2, 0.0) * count)
         seen, height = seen.reshape(shape), height.reshape(shape)
         form = settings.form
         slope = np.tan(np.radians((form.steepest_deg, settings.repose_deg))) * self._cell_d_m
@@ -281,6 +289,7 @@ class DepthJudge:
             valid,
             ground,
             fix,
+            form_is_sure=not bool((noise_m[forms.things] * SLOPE_NOISE_RATIO > form.steep_spread_m).any()),
         )
 
     def _litres(self, height: F64, where: Bools) -> Litres:

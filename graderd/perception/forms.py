@@ -9,6 +9,7 @@ one with a large smooth core is soil, with something on it or across it. This is
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from graderd.perception.geometry import F32, F64
 from graderd.perception.settings import FormSettings
 
 Bools = npt.NDArray[np.bool_]
-Counts = npt.NDArray[np.intp]
+Counts = npt.NDArray[np.integer[Any]]
 
 UNSEEN = 10.0
 """Stands for a height that is not known, metres."""
@@ -30,8 +31,8 @@ GAP_SPREAD_M = 0.040
 HANGS_M = 0.08
 """So far above what could rise there: it hangs (a hose, an arm of the machine); what stands is found by standing()."""
 ROW_CELLS_N = 5
-SLOPE_NOISE_RATIO = 1.5
-"""Noise along the line of sight lifts points of a slope that faces the camera half as much again as those of ground."""
+SLOPE_NOISE_RATIO = 2.0
+"""Noise along the line of sight lifts points of a slope that faces the camera twice as much as those of ground."""
 CELL_M = 0.04
 """Ground plan of the columns in which something standing is looked for."""
 LEVEL_M = 0.04
@@ -102,8 +103,9 @@ def sort_out(
 def steep_cells(square_m2: F64, count: Counts, noise_m: F64, settings: FormSettings) -> tuple[Bools, Bools]:
     """Cells whose points spread more in height than soil's do, and cells over which something hangs.
 
-    ``square_m2``: sum of the squares of their heights about their mean, over ``count`` points. A cell holds a few points
-    only, so that five in a row are judged together, along s and along d: a pipe is steep along one of them.
+    ``square_m2``: sum of the squares of their heights about their mean, over ``count`` points; ``noise_m``: the noise
+    of heights there. A cell holds a few points only, so that five in a row are judged together, along s and along d:
+    a pipe is steep along one of them.
     """
     freedom = np.maximum(count - 1, 0).astype(np.float64)
     variance = np.divide(square_m2, freedom, out=np.zeros(square_m2.shape), where=freedom > 0)

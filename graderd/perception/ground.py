@@ -44,9 +44,10 @@ MIN_RING_N = 25
 class Ground:
     """Surface ``z = offset_m + slope_x x + slope_y y + bend_xx x^2 + bend_xy x y + bend_yy y^2``, calibrated frame.
 
-    ``residual_m``: robust rms of the heights about it, unevenness and noise together. ``noise_m_per_m2``: the part
-    that shows between neighbouring points, over the square of their distance from the camera. ``support``: share of the flat
-    cells that lie on its plane. ``cells``: how many those are; 0 where no ground was seen and the calibration is kept.
+    ``residual_m``: robust rms of the heights about it, unevenness and noise together. ``noise_m_per_m2``: the part that
+    shows between neighbouring points, over the square of their distance from the camera. ``support``: share of the
+    flat cells that lie on its plane. ``cells``: how many those are; 0 where no ground was seen and the calibration is
+    kept.
     """
 
     offset_m: float = 0.0
