@@ -63,7 +63,7 @@ class HeightMap:
     the pixels on it that measure it, neither without depth nor hidden by something nearer. ``doubtful_l``: what of
     ``volumes_l`` lies beside something that is no soil. ``things_l``, ``weak_l``: what else rises there, and is no
     soil or does not stand out of the uneven ground. ``standing_at_m``: s and d of something that stands upright.
-    ``cut_m``: how far the edge is under what looks like ground, where no measured lift says why. ``form_is_sure``: noise
+    ``cut_m``: how far the edge is under what looks like ground, where no lift says why. ``form_is_sure``: noise
     does not drown what tells soil from things.
     """
 
@@ -262,7 +262,7 @@ class DepthJudge:
         seen = count > 0
         n = np.maximum(count, 1)
         height = np.bincount(flat, weights=z, minlength=size) / n
-        square = np.asarray(np.maximum(np.bincount(flat, weights=z * z, minlength=size) / n - height**2, 0.0) * count)
+        square: F64 = np.maximum(np.bincount(flat, weights=z * z, minlength=size) / n - height**2, 0.0) * count
         seen, height = seen.reshape(shape), height.reshape(shape)
         form = settings.form
         slope = np.tan(np.radians((form.steepest_deg, settings.repose_deg))) * self._cell_d_m
