@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graderd.core.blade import BladeGeometry, blade_coordinates
-from graderd.perception.geometry import F32, F64
+from graderd.perception.geometry import F32, F64, middle
 
 CELL_M = 0.08
 BAND_M = 0.15
@@ -139,7 +139,7 @@ class GroundFit:
         if ring.sum() < MIN_RING_N:
             ring = ground
         if ring.sum() < MIN_RING_N:
-            noise = float(np.median(spread))
+            noise = middle(spread)
             return replace(plane, residual_m=noise, noise_m_per_m2=self._per_square(noise, cx, cy))
         x, y, rest = cx[ring], cy[ring], off[ring]
         a = np.column_stack((np.ones_like(x), x, y, x * x, x * y, y * y))
@@ -149,8 +149,8 @@ class GroundFit:
             weight = 1.0 / (1.0 + ((rest - a @ bend) / SURFACE_SIGMA_M) ** 2)
             weighed = a * weight[:, None]
             bend = np.asarray(np.linalg.solve(a.T @ weighed + prior, weighed.T @ rest), dtype=np.float64)
-        uneven = 1.4826 * float(np.median(np.abs(rest - a @ bend)))
-        noise = float(np.median(spread[ring]))
+        uneven = 1.4826 * middle(np.abs(rest - a @ bend))
+        noise = middle(spread[ring])
         return replace(
             plane,
             offset_m=plane.offset_m + float(bend[0]),
@@ -165,7 +165,7 @@ class GroundFit:
 
     def _per_square(self, noise_m: float, x: F64, y: F64) -> float:
         eye_x, eye_y, eye_z = self._eye_m
-        return noise_m / float(np.median((x - eye_x) ** 2 + (y - eye_y) ** 2 + eye_z**2))
+        return noise_m / middle((x - eye_x) ** 2 + (y - eye_y) ** 2 + eye_z**2)
 
     def _cells(self, x: F32, y: F32, z: F32) -> tuple[F64, F64, F64, F64]:
         """Mean place, mean height and spread of height of the cells that hold points near the calibrated ground."""

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.hal.camera import DepthImage
-from graderd.perception.geometry import F32, F64, View, blade_points_m, face_setback_m
+from graderd.perception.geometry import F32, F64, View, blade_points_m, face_setback_m, middle
 from graderd.perception.ground import Ground
 
 NOMINAL_WIDTH_PX = 848
@@ -182,7 +182,7 @@ class BladeFinder:
             tilted = _median_slope(s, over_ground)
         else:
             tilted = rise - float(ground.slope_y * cos - ground.slope_x * sin)
-        return UpperEdge(float(np.median(z - rise * s)), rise, float(np.median(over_ground - tilted * s)))
+        return UpperEdge(middle(z - rise * s), rise, middle(over_ground - tilted * s))
 
     def displaced(self, depth_mm: DepthImage, stance: Stance) -> BladeFix:
         """What stands where the face should be, when :meth:`find` saw no face near: a face further off, or nothing.
@@ -268,8 +268,8 @@ class BladeFinder:
             return BladeFix()
         first, second = np.triu_indices(s_at.size, 3)
         slopes = (face_at[second] - face_at[first]) / (s_at[second] - s_at[first])
-        slope = float(np.median(slopes)) if slopes.size else 0.0
-        ahead = float(np.median(face_at - slope * s_at))
+        slope = middle(slopes) if slopes.size else 0.0
+        ahead = middle(face_at - slope * s_at)
         on_face = np.abs(near_face - np.float32(ahead) - np.float32(slope) * near_s) < 0.015
         along = self._ends(near_s[on_face])
         return BladeFix(ahead, along, -float(np.degrees(np.arctan(slope))), float(on_face.mean()), 0.0)
@@ -293,7 +293,7 @@ class BladeFinder:
         best = tall.argmax(axis=1)  # the rearmost where several are as tall
         upright = tall[np.arange(self.COLUMNS_N), best] >= UPRIGHT_LEVELS_N
         on_it = (place == best[column]) | (place == best[column] + 1)
-        middles = [float(np.median(face[on_it & (column == i)])) for i in np.flatnonzero(upright)]
+        middles = [middle(face[on_it & (column == i)]) for i in np.flatnonzero(upright)]
         return np.asarray(middles, dtype=np.float64), upright
 
     def _ends(self, s: F32) -> float:
@@ -317,4 +317,4 @@ def _median_slope(s: F64, z: F64) -> float:
     first, second = np.triu_indices(s.size, 1)
     apart = s[second] - s[first]
     wide = np.abs(apart) > 0.1
-    return float(np.median((z[second] - z[first])[wide] / apart[wide])) if wide.any() else 0.0
+    return middle((z[second] - z[first])[wide] / apart[wide]) if wide.any() else 0.0
