@@ -118,13 +118,15 @@ class DepthJudge:
         edge = self._finder.upper_edge(depth_mm, stance, ground)
         ground, cut_m = self._layer(ground, edge, stance)
         s, d, z = self._in_blade(points, ground, angle_deg)
-        near = np.flatnonzero((d > -0.20) & (d < STANDING_REACH_M) & (np.abs(s) < 0.7 * blade.length_m))
+        # Some way behind and beside the blade too, where its face is looked for.
+        wide = np.float32(blade.length_m / 2 + BladeFinder.SEARCH_M)
+        near = np.flatnonzero((np.abs(d - np.float32(0.22)) < np.float32(STANDING_REACH_M - 0.22)) & (np.abs(s) < wide))
         pixels, s, d, z, raw_z = pixels[near], s[near], d[near], z[near], points[2][near]
         above_edge = self._above_edge(s, z, raw_z, edge, stance)
         lean = np.float32(stance.lean) * np.clip(above_edge, 0, np.float32(blade.height_m))
         face = d + self._finder.setback(above_edge) - lean  # 0 on the face
         low = z < self._settings.max_height_m
-        fix = self._finder.find(s[low], face[low], above_edge[low], stance.tall_m(blade))
+        fix = self._finder.find(s, face, above_edge, stance.tall_m(blade))
         if fix.seen == 0:
             fix = self._finder.displaced(depth_mm, stance)
         # Small rotation and shift of the blade against its calibrated place.
@@ -294,6 +296,8 @@ class DepthJudge:
 
     def _litres(self, height: F64, where: Bools) -> Litres:
         """Litres per third of the map's cells ``where``, with what lies behind the first ones in the hollow face."""
+        if not where.any():
+            return 0.0, 0.0, 0.0
         ahead = np.where(where, height, 0.0)[:, : self._ahead_n]
         along = ahead.sum(axis=1) * self._cell_d_m + self._finder.hollow_m2(ahead[:, 0])
         right, center, left = (along.reshape(3, -1).sum(axis=1) * self._cell_s_m * 1000.0).tolist()

@@ -84,11 +84,9 @@ def sort_out(
     steep_n = np.bincount(flat, weights=(tall & steep).ravel(), minlength=count)
     core = np.divide(core_n, tall_n, out=np.ones(count), where=tall_n > 0)
     is_thing = (core * 100.0 < settings.thing_core_percent) & (steep_n > 0)
-    smooth = cv2.blur(filled, (3, 3))
-    peak = np.zeros(count)
-    np.maximum.at(peak, flat, smooth.ravel())
+    high = cv2.blur(filled, (3, 3)) > stands_out_m
     is_thing[0] = False
-    stands = (peak > stands_out_m) & ~is_thing
+    stands = (np.bincount(flat, weights=high.ravel(), minlength=count) > 0) & ~is_thing
     stands[0] = False
     weak = ~stands & ~is_thing
     weak[0] = False

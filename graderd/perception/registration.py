@@ -25,6 +25,8 @@ FACE_BAND_M = 0.16
 """The face is looked for from its upper edge down to here."""
 PLACE_M = 0.01
 LEVEL_M = 0.015
+ABOVE_PX = np.arange(1, 7)
+"""Steps above the upper edge in which nothing may stand nearer, and what lies behind must show."""
 UPRIGHT_LEVELS_N = 4
 """Soil at 45 degrees shows in no more than 3 levels within two places (2 cm)."""
 TOP_COLUMNS_N = 24
@@ -165,23 +167,17 @@ class BladeFinder:
         column, first = np.arange(len(z_optical)), face.argmax(axis=1)
         free = face.any(axis=1) & (first > 0)
         edge_m = z_optical[column, first]
-        behind = np.zeros(len(z_optical), dtype=np.intp)
-        for above in range(1, 7):
-            over = z_optical[column, np.maximum(first - above, 0)]
-            free &= (over == 0) | (over > edge_m - 0.08)
-            behind += over > edge_m + 0.08
-        free &= behind >= 2  # what has no depth may be nearer as well
+        over = z_optical[column[:, None], np.maximum(first[:, None] - ABOVE_PX, 0)] - edge_m[:, None]
+        nothing = over == -edge_m[:, None]
+        free &= (nothing | (over > -0.08)).all(axis=1)
+        free &= (over > 0.08).sum(axis=1) >= 2  # what has no depth may be nearer as well
         if free.sum() < TOP_COLUMNS_N // 3:
             return None
         x, y, z = (at[column[free], first[free], axis].astype(np.float64) for axis in range(3))
         s = y * cos - x * sin
         over_ground = z - ground.height_at(x, y)
-        rise = stance.rise
-        if np.ptp(s) > 0.4 * blade.length_m:
-            rise = _median_slope(s, z)
-            tilted = _median_slope(s, over_ground)
-        else:
-            tilted = rise - float(ground.slope_y * cos - ground.slope_x * sin)
+        rise = _median_slope(s, z) if s.max() - s.min() > 0.4 * blade.length_m else stance.rise
+        tilted = rise - float(ground.slope_y * cos - ground.slope_x * sin)
         return UpperEdge(middle(z - rise * s), rise, middle(over_ground - tilted * s))
 
     def displaced(self, depth_mm: DepthImage, stance: Stance) -> BladeFix:
@@ -284,7 +280,7 @@ class BladeFinder:
         place = ((face + np.float32(self.SEARCH_M)) * np.float32(1 / PLACE_M)).astype(np.int32)
         place = np.minimum(place, places_n - 1)
         levels_n = round(FACE_BAND_M / LEVEL_M)
-        level = np.clip((below_m * np.float32(1 / LEVEL_M)).astype(np.int32), 0, levels_n - 1)
+        level = np.minimum((np.maximum(below_m, 0) * np.float32(1 / LEVEL_M)).astype(np.int32), levels_n - 1)
         shape = (self.COLUMNS_N, places_n, levels_n)
         index = (column * places_n + place) * levels_n + level
         shown = np.bincount(index, minlength=self.COLUMNS_N * places_n * levels_n).reshape(shape) > 0
