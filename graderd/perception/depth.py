@@ -47,6 +47,8 @@ STANDING_REACH_M = 0.60
 """So far ahead of the face what stands is looked for: a person a step before the soil's zone."""
 SUNK_M = 0.017
 """The edge lower than it should be by more than this: what looks like ground is a layer of soil, or is being cut."""
+LAYER_SIGMAS = 3.0
+"""A layer stands out by this many times the unevenness: its own edges are part of that."""
 LIFTS_AGREE_M = 0.10
 """Edge and measured lifts further apart than this: one of the two is wrong."""
 UNEVEN_SHARE = 0.15
@@ -152,7 +154,9 @@ class DepthJudge:
         deep_m = stance.edge_m(self._blade) + stance.tall_m(self._blade) - edge.above_ground_m
         if deep_m < SUNK_M:
             return ground, 0.0
-        stands_out = deep_m > self._settings.noise_factor_ratio * ground.residual_m
+        rough_m = ground.noise_m_per_m2 * float(np.sum(self._view.position_m**2))
+        uneven_m = LAYER_SIGMAS * ground.residual_m
+        stands_out = deep_m > max(self._settings.noise_factor_ratio * rough_m, uneven_m)
         if stance.attitude.height_mm is None or not stands_out or deep_m > LIFTS_AGREE_M:
             return ground, deep_m
         return replace(ground, offset_m=ground.offset_m - deep_m), 0.0
