@@ -42,8 +42,9 @@ LEVEL_POINTS_N = 2
 """Points in a level: a single one may be a wrong match."""
 LOWEST_M = 0.04
 LOW_STARTS_N = 3
-"""It must begin below 16 cm: what hangs from above (hoses, the machine's arms) does not stand."""
-HIGHEST_M = 0.40
+"""It must begin below 16 cm, or on soil beside it: what hangs from above (hoses, the machine's arms) does not stand."""
+BESIDE_COLUMNS_N = 2
+HIGHEST_M = 0.52
 STANDING_FROM_M = 0.06
 """Nearer to the face than this, the face itself may show."""
 STANDING_COLUMNS_N = 2
@@ -135,13 +136,28 @@ def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[flo
     k = ((z[inside] - np.float32(LOWEST_M)) * np.float32(1 / LEVEL_M)).astype(np.int32)
     counts = np.bincount((i * rows_n + j) * levels_n + k, minlength=columns_n * rows_n * levels_n)
     there = counts.reshape(columns_n, rows_n, levels_n) >= LEVEL_POINTS_N
-    runs = there[:, :, :LOW_STARTS_N].copy()
+    runs = there[:, :, : 1 - LEVELS_N].copy()
     for level in range(1, LEVELS_N):
-        runs &= there[:, :, level : level + LOW_STARTS_N]
-    at_s, at_d = np.nonzero(runs.any(axis=2))
-    if at_s.size < STANDING_COLUMNS_N:
+        runs &= there[:, :, level : there.shape[2] - LEVELS_N + 1 + level]
+    upright = np.asarray(runs.any(axis=2), dtype=np.bool_)
+    if np.count_nonzero(upright) < STANDING_COLUMNS_N:
         return None
-    return float(np.median(at_s) + 0.5) * CELL_M - half_m, float(np.median(at_d) + 0.5) * CELL_M
+    starts = runs.argmax(axis=2)
+    soil = np.where(there.any(axis=2) & ~upright, there.argmax(axis=2), -1)
+    found = [
+        at for at in np.argwhere(upright) if starts[*at] < LOW_STARTS_N or starts[*at] <= _level(soil, upright, at) + 1
+    ]
+    if len(found) < STANDING_COLUMNS_N:
+        return None
+    at_s, at_d = np.median(found, axis=0)
+    return float(at_s + 0.5) * CELL_M - half_m, float(at_d + 0.5) * CELL_M
+
+
+def _level(soil: Counts, upright: Bools, at: Counts) -> int:
+    """The level at which soil lies beside an upright column."""
+    around = tuple(slice(max(i - BESIDE_COLUMNS_N, 0), i + BESIDE_COLUMNS_N + 1) for i in at)
+    plain = soil[around][~upright[around]]
+    return int(np.median(plain)) if plain.size else -1
 
 
 def above_neighbours(height: F64, seen: Bools, rise_per_cell: float) -> F64:

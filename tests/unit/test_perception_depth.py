@@ -9,7 +9,6 @@ from graderd.core.soil import Zone
 from graderd.hal.camera import DepthImage
 from graderd.perception import CameraCalibration, PerceptionSettings
 from graderd.perception.depth import DepthJudge, HeightMap
-from graderd.perception.forms import fill_hidden
 from graderd.perception.geometry import LEFT, RIGHT, View
 from graderd.perception.registration import Stance
 from harness.perception_scenes import PoseError, Scene, height_field, render, volumes_l
@@ -103,10 +102,3 @@ def test_mirrored_soil_gives_mirrored_litres() -> None:
 def test_same_picture_same_answer() -> None:
     judge, depth = judge_of(Scene(zone=Zone.CENTER, seed=9))
     assert judge.height_map(depth, Stance(10.0)).volumes_l == judge.height_map(depth, Stance(10.0)).volumes_l
-
-
-def test_hidden_cells_fall_from_the_crest() -> None:
-    height = np.array([[0.0, 0.0, 0.0, 0.10, 0.05]])
-    seen = np.array([[False, False, False, True, True]])
-    filled = fill_hidden(height, seen, 0.03, 0.06)
-    assert filled[0] == pytest.approx([0.01, 0.04, 0.07, 0.10, 0.05])
