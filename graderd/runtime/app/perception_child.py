@@ -23,7 +23,7 @@ from pydantic import BaseModel, ValidationError
 from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.hal.camera import Camera, EndOfFrames, Frame, Intrinsics
 from graderd.hal.errors import DeviceError, DeviceTimeoutError
-from graderd.hal.settings import CameraSettings
+from graderd.hal.settings import DEPTH_PRESETS, CameraSettings
 from graderd.perception.classifier import Classifier, judge_frame, make_classifier
 from graderd.perception.frame_set import Entry, FrameSetWriter
 from graderd.perception.settings import CameraCalibration, StreamCalibration
@@ -202,8 +202,14 @@ def with_lens_of(frame: Frame, calibration: CameraCalibration) -> CameraCalibrat
 def settings_not_kept(settings: CameraSettings, read_back: dict[str, float]) -> tuple[str, ...]:
     """Settings whose read-back value is more than 5 % off what was asked for."""
     wrong = []
-    for name in ("exposure_us", "gain", "white_balance_k"):
-        wanted = getattr(settings, name)
+    colour, depth = ("exposure_us", "gain", "white_balance_k"), ("depth_laser_mw", "depth_exposure_us", "depth_gain")
+    asked: dict[str, float | None] = {name: getattr(settings, name) for name in (*colour, *depth)}
+    asked["depth_emitter"] = float(settings.depth_emitter)
+    if settings.depth_preset is not None:
+        asked["depth_preset"] = float(DEPTH_PRESETS.index(settings.depth_preset))
+    if not settings.depth_emitter:
+        asked["depth_laser_mw"] = None
+    for name, wanted in asked.items():
         got = read_back.get(name)
         if wanted is not None and got is not None and abs(got - wanted) > 0.05 * wanted:
             wrong.append(f"{name}: asked {wanted:g}, device says {got:g}")
