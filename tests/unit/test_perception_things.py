@@ -7,7 +7,6 @@ import functools
 import numpy as np
 import pytest
 
-from benchmarks.perception_things import COLOR_SIZE, DEPTH_SIZE, SIDES, photograph
 from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import SoilObservation, Zone
@@ -19,6 +18,7 @@ from graderd.perception.geometry import F32, F64
 from graderd.perception.settings import FormSettings
 from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.piles import SceneZone
+from harness.perception_things import COLOR_SIZE, DEPTH_SIZE, SIDES, photograph
 
 ON_GROUND = MeasuredAttitude(2.0, 0.0, 0.0)
 
@@ -37,7 +37,7 @@ def judged(frame: Frame, angle_deg: float, method: Method = "depth") -> SoilObse
 @pytest.mark.parametrize("loaded", [SceneZone.NONE, SceneZone.CENTER])
 def test_legs_are_obstructed_wherever_they_stand(side: Zone, loaded: SceneZone) -> None:
     for number, angle_deg in enumerate((-30.0, 0.0, 45.0)):
-        frame, _ = photograph(renderer(), "legs", side, loaded, angle_deg, number)
+        frame = photograph(renderer(), "legs", side, loaded, angle_deg, number)
         observation = judged(frame, angle_deg)
         assert [fault.condition for fault in observation.faults] == ["obstructed"]
         assert observation.zone is Zone.UNKNOWN
@@ -48,15 +48,15 @@ def test_legs_are_obstructed_wherever_they_stand(side: Zone, loaded: SceneZone) 
 @pytest.mark.parametrize("kind", ["foliage", "pipe"])
 @pytest.mark.parametrize("side", [Zone.LEFT, Zone.RIGHT])
 def test_what_lies_there_and_is_no_soil_does_not_count(kind: str, side: Zone) -> None:
-    empty, _ = photograph(renderer(), kind, side, SceneZone.NONE, 15.0, 2)
+    empty = photograph(renderer(), kind, side, SceneZone.NONE, 15.0, 2)
     assert judged(empty, 15.0).zone in (Zone.NONE, Zone.UNKNOWN)
     opposite = SceneZone.RIGHT if side is Zone.LEFT else SceneZone.LEFT
-    loaded, _ = photograph(renderer(), kind, side, opposite, 15.0, 2)
+    loaded = photograph(renderer(), kind, side, opposite, 15.0, 2)
     assert judged(loaded, 15.0).zone in (Zone(str(opposite)), Zone.UNKNOWN)
 
 
 def test_a_colour_method_sees_who_stands_there_too() -> None:
-    frame, _ = photograph(renderer(), "legs", Zone.LEFT, SceneZone.NONE, 0.0, 1)
+    frame = photograph(renderer(), "legs", Zone.LEFT, SceneZone.NONE, 0.0, 1)
     classifier = make_classifier(PerceptionSettings(method="fast_color"), CameraCalibration(), BladeGeometry())
     assert [fault.condition for fault in classifier.classify(frame, 0.0, 0.0, ON_GROUND).faults] == ["obstructed"]
 
