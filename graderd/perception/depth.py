@@ -185,9 +185,11 @@ class DepthJudge:
                 f"the edge seems to be {soil.cut_m * 1000:.0f} mm in the ground: cut ground and a level layer of soil "
                 "look the same without a measured lift that agrees"
             )
-        if verdict.zone is Zone.NONE and not soil.form_is_sure and sum(soil.things_l) > settings.none_volume_l:
+        things_l = sum(soil.things_l)
+        most_l = settings.form.thing_largest_l if soil.form_is_sure else settings.none_volume_l
+        if verdict.zone is Zone.NONE and things_l > most_l:
             return verdict.unknown(
-                f"{sum(soil.things_l):.1f} l lie there, and noise hides whether they have the form of soil"
+                f"{things_l:.1f} l lie there whose form is not soil's, or hidden by noise, dust or drops"
             )
         if any(soil.doubtful_l):
             sure_l = np.subtract(soil.volumes_l, soil.doubtful_l)

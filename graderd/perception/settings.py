@@ -91,6 +91,10 @@ class FormSettings(Settings):
     thing_core_percent: Percent = Field(
         default=20.0, description="a lump with less than this clear of steep cells is no soil"
     )
+    thing_largest_l: Positive = Field(
+        default=7.0,
+        description="more than this without the form of soil is soil seen badly, or a heap of things: unknown",
+    )
     lowest_m: Positive = Field(default=0.006, description="what is lower than this is ground")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -102,3 +103,36 @@ def test_mirrored_soil_gives_mirrored_litres() -> None:
 def test_same_picture_same_answer() -> None:
     judge, depth = judge_of(Scene(zone=Zone.CENTER, seed=9))
     assert judge.height_map(depth, Stance(10.0)).volumes_l == judge.height_map(depth, Stance(10.0)).volumes_l
+
+
+def blobs(shape: tuple[int, int], share: float, size_px: float) -> np.ndarray:
+    field = cv2.GaussianBlur(np.random.default_rng(3).normal(size=shape), (0, 0), size_px)
+    return np.asarray(field > np.quantile(field, 1 - share))
+
+
+def spoilt(depth: DepthImage, how: str) -> DepthImage:
+    rng = np.random.default_rng(5)
+    z = depth.astype(np.float64)
+    if how == "flare":
+        z[:, z.shape[1] // 3 : 2 * z.shape[1] // 3] = 0
+    elif how == "mud":
+        z[blobs(depth.shape, 0.35, 25)] = 0
+    elif how == "dust":
+        near = cv2.GaussianBlur(rng.normal(size=z.shape), (0, 0), 6)
+        cloud = blobs(depth.shape, 0.5, 20)
+        z[cloud] = np.minimum(z, 700 + 80 * near / near.std())[cloud]
+    else:
+        for _ in range(12):
+            drop = np.zeros(depth.shape, np.uint8)
+            at = (int(rng.integers(depth.shape[1])), int(rng.integers(depth.shape[0])))
+            cv2.circle(drop, at, int(rng.integers(8, 22)), 1, -1)
+            z = np.where(drop > 0, z * rng.uniform(0.85, 1.1) + rng.normal(0, 30, z.shape), z)
+    return np.clip(z, 0, 65535).astype(np.uint16)
+
+
+@pytest.mark.parametrize("how", ["dust", "flare", "drops", "mud"])
+@pytest.mark.parametrize("zone", [Zone.NONE, Zone.LEFT, Zone.RIGHT])
+def test_dust_flare_drops_and_mud_make_no_other_answer(how: str, zone: Zone) -> None:
+    judge, depth = judge_of(Scene(zone=zone, seed=6, noise_px=0.2))
+    verdict = judge.verdict(judge.height_map(spoilt(depth, how), Stance(0.0)))
+    assert verdict.zone in (zone, Zone.UNKNOWN), verdict.reason
