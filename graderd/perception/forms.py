@@ -43,6 +43,8 @@ LEVEL_POINTS_N = 2
 LOWEST_M = 0.04
 LOW_STARTS_N = 3
 """It must begin below 16 cm, or on soil beside it: what hangs from above (hoses, the machine's arms) does not stand."""
+ON_SOIL_STARTS_N = 5
+"""On soil too it begins below 24 cm: higher, the machine's arms touch a heap that fills the blade."""
 BESIDE_COLUMNS_N = 2
 HIGHEST_M = 0.52
 STANDING_FROM_M = 0.06
@@ -145,7 +147,9 @@ def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[flo
     starts = runs.argmax(axis=2)
     soil = np.where(there.any(axis=2) & ~upright, there.argmax(axis=2), -1)
     found = [
-        at for at in np.argwhere(upright) if starts[*at] < LOW_STARTS_N or starts[*at] <= _level(soil, upright, at) + 1
+        at
+        for at in np.argwhere(upright)
+        if starts[*at] < LOW_STARTS_N or starts[*at] <= min(_level(soil, upright, at) + 1, ON_SOIL_STARTS_N - 1)
     ]
     if len(found) < STANDING_COLUMNS_N:
         return None
