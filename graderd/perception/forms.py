@@ -43,8 +43,8 @@ LEVEL_POINTS_N = 2
 LOWEST_M = 0.04
 LOW_STARTS_N = 3
 """It must begin below 16 cm, or on soil beside it: what hangs from above (hoses, the machine's arms) does not stand."""
-ON_SOIL_STARTS_N = 5
-"""On soil too it begins below 24 cm: higher, the machine's arms touch a heap that fills the blade."""
+ON_SOIL_STARTS_N = 4
+"""On soil too it begins below 20 cm: higher, the machine's arms touch a heap that fills the blade."""
 BESIDE_COLUMNS_N = 2
 HIGHEST_M = 0.52
 STANDING_FROM_M = 0.06
