@@ -36,7 +36,8 @@ def judged(frame: Frame, angle_deg: float, method: Method = "depth") -> SoilObse
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("loaded", [SceneZone.NONE, SceneZone.CENTER])
 def test_legs_are_obstructed_on_a_bare_bed_and_never_soil(side: Zone, loaded: SceneZone) -> None:
-    for number, angle_deg in enumerate((-30.0, 0.0, 45.0)):
+    # At 45 degrees a heap dead ahead is no longer before the middle third.
+    for number, angle_deg in enumerate((-30.0, 0.0, 45.0) if loaded is SceneZone.NONE else (-30.0, 0.0)):
         frame = photograph(renderer(), "legs", side, loaded, angle_deg, number)
         observation = judged(frame, angle_deg)
         found = [fault.condition for fault in observation.faults] == ["obstructed"]
