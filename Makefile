@@ -20,7 +20,10 @@ PYTHON_TARGETS ?= run test
 FIND_PYTHON = PYENV_VERSION=$* $(BIN)/uv python find --system --no-python-downloads
 SOAK_S ?= 900
 
-.PHONY: help run test quick test-pythons faults deb hil soak soak-virtual-time hil-package hil-arm64 hil-usb bench-hw check format lock clean
+TESTS  := $(BIN)/python -m pytest -p tests.run_times
+BESIDE := -n 2 --dist loadgroup
+
+.PHONY: help run test unit quick passes test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean mutants mutants-wide core-coverage
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
@@ -66,12 +69,15 @@ $(STAMP): $(LOCKED) pyproject.toml
 run: $(STAMP) ## drive the demonstration on the simulated grader (ARGS=--json for one object a line)
 	@$(BIN)/graderd demo $(ARGS)
 
-test: $(STAMP) ## run the tests
-	@$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not serial_only" $(PYTEST_ARGS)
-	@$(BIN)/python -m pytest -m serial_only $(PYTEST_ARGS)
+test: $(STAMP) ## run the tests; run times by file at the end of each part
+	@$(TESTS) $(BESIDE) -m "not serial_only" $(PYTEST_ARGS)
+	@$(TESTS) -m serial_only $(PYTEST_ARGS)
+
+unit: $(STAMP) ## run the pure tests: no process, no socket, seconds
+	@$(TESTS) $(BESIDE) -m "not live and not serial_only and not slow" $(PYTEST_ARGS) tests/unit
 
 quick: $(STAMP) ## run the tests of functions, contracts and wires that take no ten seconds each
-	@$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not serial_only and not slow" $(PYTEST_ARGS) tests/unit tests/contract tests/wire
+	@$(TESTS) $(BESIDE) -m "not serial_only and not slow" $(PYTEST_ARGS) tests/unit tests/contract tests/wire
 
 test-pythons: $(PYTHONS:%=test-python-%) ## both commands on each Python that README names, one after the other
 
@@ -79,6 +85,9 @@ test-python-%: $(STAMP)
 	@python=$$($(FIND_PYTHON) $* 2>/dev/null || { $(BIN)/uv python install --quiet $* >&2 && $(FIND_PYTHON) $*; }) \
 	|| { echo "test-pythons: no Python $* on this machine, nor can uv download one; install it, or PYTHONS=\"...\" for the others" >&2; exit 1; }; \
 	$(MAKE) --no-print-directory VENV=.venv-$* PYTHON=$$python $(PYTHON_TARGETS)
+
+passes: $(STAMP) ## whole passes on rig and daemon, 144 of them, more than an hour (ARGS="--sample 20", ARGS=--loop)
+	@$(BIN)/python -m benchmarks.passes $(ARGS)
 
 faults: $(STAMP) ## inject every fault in every phase of work (ARGS="--short --json" for a part of it)
 	@$(BIN)/python -m harness.campaign $(ARGS)
@@ -119,9 +128,16 @@ hil-usb: $(STAMP) ## QEMU: an FTDI adapter pulled and plugged, two SJA1000 contr
 bench-hw: $(STAMP) ## tests against real hardware; asks before each motion (needs GRADERD_BENCH=1 and a terminal)
 	@PYTHONPATH=. $(BIN)/python -m hil.bench $(BENCH_ARGS)
 
+monitor: $(STAMP) ## a million random ticks, and a thousand moves of the lifts of each kind, judged from outside (half an hour)
+	@GRADERD_MONITOR_TICKS=1000000 $(BIN)/python -m pytest -q tests/unit/test_core_tick_monitor.py
+	@$(BIN)/python -m benchmarks.lift_pair
+
 mutants: $(STAMP) ## mutate gate, state machine and fault monitor; list what the tests let live
 	@$(BIN)/python -m mutmut run $(ARGS)
 	@$(BIN)/python -m mutmut results
+
+mutants-wide: $(STAMP) ## seed thirty mistakes in runtime, drivers and interface; each must be noticed by its nearest tests
+	@$(BIN)/python -m harness.mutants_wide $(ARGS)
 
 core-coverage: $(STAMP) ## branch coverage of gate, state machine and fault monitor by their own tests (must be 100 %)
 	@$(BIN)/python -m pytest -q -n 2 --cov=graderd.core.gate --cov=graderd.core.machine --cov=graderd.core.faults --cov-branch --cov-fail-under=100 --cov-report=term-missing tests/unit/test_core_gate.py tests/unit/test_core_machine.py tests/unit/test_core_machine_model.py tests/unit/test_core_golden.py tests/unit/test_fault_catalogue.py

@@ -1,10 +1,10 @@
-"""graderd's J1939 beside cantools and can-j1939: codec, whole receive and send path, and steadiness of the schedule.
+"""graderd's J1939 beside cantools and python-can-j1939: codec, receive and send path, steadiness of the schedule.
 
 ``python benchmarks/j1939.py [--seconds N] [--json]``. The three are measured in one run on one machine; the period
-measurement runs graderd and can-j1939 at the same time, each in a process and on an slcan adapter of its own, with the
-same 800 frames a second coming in (run it on a machine that is otherwise quiet: the tail of the period error is the
-machine's where its cores are taken). Exit status 1 where a
-bar is missed: ahead of can-j1939 everywhere, and no more than a fifth behind bare cantools as a codec.
+measurement runs graderd and python-can-j1939 at the same time, each in a process and on an slcan adapter of its own,
+with the same 800 frames a second coming in (run it on a machine that is otherwise quiet: the tail of the period error
+is the machine's where its cores are taken). Exit status 1 where a bar is missed: ahead of python-can-j1939 everywhere,
+and no more than a fifth behind bare cantools as a codec.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Axis:
 
 
 def measure_codec(seconds: float) -> dict[str, dict[str, Measured]]:
-    """Eight bytes to values and back: ours, cantools, and can-j1939 with cantools (it has no codec of its own)."""
+    """Eight bytes to values and back: ours, cantools, and python-can-j1939 with cantools (it has no codec)."""
     codec, database = ElectrakCodec("electrak_hd"), load_database("electrak_hd")
     afm, acm = database.get_message_by_name("AFM"), database.get_message_by_name("ACM")
     control = Control(150.0, 18.0, 80.0, motion_enable=True)
@@ -154,11 +154,11 @@ def measure_path(seconds: float) -> dict[str, dict[str, Measured]]:
         return {
             "receive: frame to values": {
                 "graderd": rate(lambda: link._on_frame(frame, 0.0), seconds),
-                "can-j1939": rate(lambda: ecu.notify(AFM_ID, bytearray(AFM), 0.0), seconds),
+                "python-can-j1939": rate(lambda: ecu.notify(AFM_ID, bytearray(AFM), 0.0), seconds),
             },
             "send: values to frame": {
                 "graderd": rate(lambda: link.send_control(axis), seconds),
-                "can-j1939": rate(
+                "python-can-j1939": rate(
                     lambda: peer.send_pgn(0, 0xEF, 0x13, 6, list(acm.encode(values, strict=False))), seconds
                 ),
             },
@@ -216,7 +216,7 @@ def ours_main(channel: str, seconds: float, out: multiprocessing.queues.Queue[An
 
 
 def theirs_main(channel: str, seconds: float, out: multiprocessing.queues.Queue[Any]) -> None:
-    """One process: can-j1939 on python-can's slcan, with its cyclic timer."""
+    """One process: python-can-j1939 on python-can's slcan, with its cyclic timer."""
     codec = ElectrakCodec("electrak_hd")
     data = list(codec.encode_control(Control(150.0, 18.0, 80.0, motion_enable=True)))
     cpu_s = time.process_time()
@@ -236,7 +236,7 @@ def theirs_main(channel: str, seconds: float, out: multiprocessing.queues.Queue[
 
     peer.add_timer(0.1, send)
     time.sleep(seconds)
-    out.put(("can-j1939", stamps_s, time.process_time() - cpu_s))
+    out.put(("python-can-j1939", stamps_s, time.process_time() - cpu_s))
     peer.stop()
     ecu.stop()
     ecu.disconnect()
@@ -266,8 +266,8 @@ def measure_period(seconds: float) -> dict[str, Measured]:
     context = multiprocessing.get_context("spawn")
     out: multiprocessing.queues.Queue[Any] = context.Queue()
     with tempfile.TemporaryDirectory() as folder:
-        adapters = {name: Adapter(Path(folder), name) for name in ("graderd", "can-j1939")}
-        mains = {"graderd": ours_main, "can-j1939": theirs_main}
+        adapters = {name: Adapter(Path(folder), name) for name in ("graderd", "python-can-j1939")}
+        mains = {"graderd": ours_main, "python-can-j1939": theirs_main}
         processes: list[multiprocessing.process.BaseProcess] = [
             context.Process(target=mains[name], args=(str(adapter.link), seconds, out))
             for name, adapter in adapters.items()
@@ -301,8 +301,8 @@ def judge(rates: dict[str, dict[str, Measured]], period: dict[str, Measured]) ->
             ):
                 missed.append(f"{name}: behind {other}")
     for figure in ("error_p99_ms", "cpu_percent"):
-        if period["graderd"][figure] > period["can-j1939"][figure]:
-            missed.append(f"period {figure}: behind can-j1939")
+        if period["graderd"][figure] > period["python-can-j1939"][figure]:
+            missed.append(f"period {figure}: behind python-can-j1939")
     return missed
 
 

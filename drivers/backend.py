@@ -15,7 +15,7 @@ from graderd.hal.camera import Camera
 from graderd.hal.clock import Clock
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.rotator import Rotator
-from graderd.hal.service import DeviceService
+from graderd.hal.service import DeviceService, WatchBus
 from graderd.hal.settings import ActuatorSettings, CameraSettings, CanSettings, RotatorSettings, StopInputSettings
 from graderd.hal.stop_input import StopInput
 
@@ -39,19 +39,25 @@ def _no_services(_: Any) -> Mapping[str, DeviceService]:
     return {}
 
 
+def _no_buses(_: Any) -> Mapping[str, WatchBus]:
+    return {}
+
+
 @dataclass(frozen=True, slots=True)
 class RotatorBackend(Generic[RotatorS, RotatorD]):
     """A driver of the blade's rotation.
 
     ``build`` returns it closed. ``safe_off`` ends motion without a daemon and without the driver: a synchronous
     function that opens the wire anew, takes a second at most, returns a line for the log and raises ``DeviceError``
-    where it could not reach the device. ``services``: by name, without the axis.
+    where it could not reach the device. ``services``: by name, without the axis. ``buses``: wires of its own that can
+    be watched, by the name that they have for clients.
     """
 
     settings: type[RotatorS]
     build: Callable[[RotatorS, Parts], RotatorD]
     safe_off: Callable[[RotatorS, CanSettings], str]
     services: Callable[[RotatorD], Mapping[str, DeviceService]] = _no_services
+    buses: Callable[[RotatorD], Mapping[str, WatchBus]] = _no_buses
 
 
 @dataclass(frozen=True, slots=True)

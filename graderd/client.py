@@ -55,6 +55,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+STOP_SUFFIX: Final = ".stop"
+"""Beside the interface's socket ``graderd.sock``, ``graderd.stop`` serves nothing but stop."""
 TIMEOUT_S: Final = 5.0
 SERVICE_TIMEOUT_S: Final = 120.0
 LEASE_HZ: Final = 10.0
@@ -259,9 +261,9 @@ class Client:
         return self._request("GET", "/v1/preview.jpg")
 
     @contextmanager
-    def bus_text(self) -> Iterator[Iterator[str]]:
-        """The CAN bus as candump text, some lines a piece; a line that begins with ``#`` tells of lost frames."""
-        with self._websocket("/v1/can") as stream:
+    def bus_text(self, name: str = "can") -> Iterator[Iterator[str]]:
+        """A wire's traffic (``can``, ``servo``), some lines a piece; one that begins with ``#`` tells of lost ones."""
+        with self._websocket(f"/v1/bus/{quote(name, safe='')}") as stream:
             yield iter(lambda: str(stream.recv()), None)
 
     # -- commands ------------------------------------------------------------------------------------------------------
@@ -319,7 +321,7 @@ class Client:
         payload = None if body is None else json.dumps(body, allow_nan=False)
         give_up_s = time.monotonic() + BUSY_RETRY_S
         while True:
-            connection = self._address.http_connection(timeout_s or self.timeout_s)
+            connection = self._address.http_connection(timeout_s or self.timeout_s, path)
             went_out = False
             try:
                 connection.connect()
@@ -519,9 +521,9 @@ class AsyncClient:
         return await _in_thread(self._waiting.preview_jpeg)
 
     @asynccontextmanager
-    async def bus_text(self) -> AsyncIterator[AsyncIterator[str]]:
+    async def bus_text(self, name: str = "can") -> AsyncIterator[AsyncIterator[str]]:
         """See :meth:`Client.bus_text`."""
-        async with self._websocket("/v1/can") as stream:
+        async with self._websocket(f"/v1/bus/{quote(name, safe='')}") as stream:
 
             async def take() -> str:
                 return str(await stream.recv())
@@ -685,9 +687,12 @@ class _Address:
     def websocket_uri(self, path: str, query: Mapping[str, str | float]) -> str:
         return f"ws://{self.netloc}{path}{'?' if query else ''}{urlencode(query)}"
 
-    def http_connection(self, timeout_s: float) -> http.client.HTTPConnection:
+    def http_connection(self, timeout_s: float, for_path: str = "") -> http.client.HTTPConnection:
         if self.path is None:
             return http.client.HTTPConnection(self.host, self.port_n, timeout=timeout_s)
+        stop_socket = self.path.with_suffix(STOP_SUFFIX)
+        if for_path == "/v1/stop" and stop_socket.is_socket():  # where nobody else waits; an older daemon has none
+            return _UnixConnection(stop_socket, timeout_s)
         return _UnixConnection(self.path, timeout_s)
 
     def checked(self, status_code: int, body: bytes) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,6 +29,8 @@ from graderd.core.status import (
     Status,
 )
 from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.service import DeviceService
+from graderd.hal.settings import Finite, Settings
 from harness.awake_clock import AwakeClock
 
 T = TypeVar("T")
@@ -36,6 +38,21 @@ T = TypeVar("T")
 TICK_S = 0.02
 SPEED_PER_S = {"rotation": 60.0, "lift_left": 200.0, "lift_right": 200.0, "tilt": 100.0}
 LIMITS = {"rotate": 60.0, "lift": 295.0, "tilt": 97.0, "height": 195.0, "slope": 20.0, "pitch": 14.0}
+
+
+class StepArguments(Settings):
+    step_deg: Finite = 10.0
+
+
+async def _nothing(_: Any) -> dict[str, Any]:
+    return {}
+
+
+SERVICES = {
+    "rotation.verify_profile": DeviceService(_nothing, only_reads=True),
+    "rotation.reboot": DeviceService(_nothing),
+    "rotation.step_response": DeviceService(_nothing, moves=True, arguments=StepArguments),
+}
 JPEG = b"\xff\xd8\xff\xe0 not much of a picture \xff\xd9"
 
 
@@ -54,6 +71,7 @@ class FakeDaemon:
     seen: list[cmd.Command] = field(default_factory=list)
     held: dict[str, FaultStatus] = field(default_factory=dict)
     bus_watched_n: int = 0
+    maneuvers: list[str] = field(default_factory=list)
     state: State = field(default_factory=State)
     positions: dict[str, float] = field(
         default_factory=lambda: {"rotation": 0.0, "lift_left": 100.0, "lift_right": 100.0, "tilt": 50.0}
@@ -86,11 +104,12 @@ class FakeDaemon:
             await self._ticked.wait()
         return self._status
 
+    def stop(self, command: cmd.Stop) -> cmd.Reply:
+        (reply,) = self._step([command])
+        self._status = self._make_status(self._clock.now_s())
+        return reply
+
     async def command(self, command: cmd.Command) -> cmd.Reply:
-        if isinstance(command, cmd.Stop) and not self.frozen:
-            (reply,) = self._step([command])
-            self._status = self._make_status(self._clock.now_s())
-            return reply
         future: asyncio.Future[cmd.Reply] = asyncio.get_running_loop().create_future()
         self.waiting.append((command, future))
         return await future
@@ -103,13 +122,21 @@ class FakeDaemon:
             raise ServiceError("no picture yet", "look at the camera's cable")
         return self.picture
 
-    async def bus_text(self) -> AsyncGenerator[str, None]:
+    def bus_text(self, name: str) -> AsyncGenerator[str, None]:
+        if name != "can":
+            raise ServiceError(f"there is no bus '{name}'", "there are: can")
+        return self._bus_text()
+
+    async def _bus_text(self) -> AsyncGenerator[str, None]:
         try:
-            for line in ("(1.000000) can0 18EF1300#DC05191500000000\n", "# 3 frames lost: the reader is too slow\n"):
+            for line in ("(1.000000) can0 18EF1300#DC05191500000000\n", "# 3 lines lost: the reader is too slow\n"):
                 yield line
             await asyncio.Event().wait()
         finally:
             self.bus_watched_n += 1
+
+    def services(self) -> Mapping[str, DeviceService]:
+        return SERVICES
 
     async def service(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         if name == "rotation.verify_profile":
@@ -118,6 +145,12 @@ class FakeDaemon:
             if arguments.get("consent") is not True:
                 raise ServiceError("a reboot lets the blade turn freely for a moment", "send consent: true")
             return {"rebooted": True}
+        if name == "rotation.step_response":
+            self.maneuvers.append("began")
+            try:
+                await asyncio.Event().wait()
+            finally:
+                self.maneuvers.append("ended")
         raise ServiceError(f"there is no service {name}", "see /v1/openapi.json")
 
     def _tick(self, now_s: float) -> None:

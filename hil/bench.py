@@ -160,15 +160,15 @@ class Bench:
     def _jog(self, axis: str, value: float, done: Callable[[Status], bool]) -> list[tuple[float, Status]]:
         """Jog while renewing the lease until ``done`` or time-out; what was seen on the way."""
         began_s, trace = time.monotonic(), []
-        self._client.command("jog", axis=axis, value=value, relative=True)
-        while time.monotonic() - began_s < STEP_TIMEOUT_S:
-            status = self._status()
-            trace.append((time.monotonic() - began_s, status))
-            if done(status):
-                break
-            self._client.command("renew")
-            time.sleep(RENEW_S / 2)
-        self._client.command("release")
+        with self._client.lease() as lease:
+            lease.jog(axis, value, relative=True)
+            while time.monotonic() - began_s < STEP_TIMEOUT_S:
+                status = self._status()
+                trace.append((time.monotonic() - began_s, status))
+                if done(status):
+                    break
+                lease.renew()
+                time.sleep(RENEW_S / 2)
         return trace
 
     def _note(self, name: str, *, ok: bool, **figures: float | str) -> None:

@@ -195,16 +195,16 @@ class Grader:
             WaitError: it did not get there.
         """
         until_s = time.monotonic() + timeout_s
-        self.client.command("jog", axis=axis, value=value)
-        while not done(self.status()):
-            if time.monotonic() > until_s:
-                raise WaitError(f"jog {axis} {value}: not within {timeout_s:g} s; {brief(self.status())}")
-            time.sleep(ASK_EVERY_S)
-            try:
-                self.client.command("renew")
-            except RefusedError:
-                self.client.command("jog", axis=axis, value=value)
-        self.client.command("release")
+        with self.client.lease() as lease:
+            lease.jog(axis, value)
+            while not done(self.status()):
+                if time.monotonic() > until_s:
+                    raise WaitError(f"jog {axis} {value}: not within {timeout_s:g} s; {brief(self.status())}")
+                time.sleep(ASK_EVERY_S)
+                try:
+                    lease.renew()
+                except RefusedError:
+                    lease.jog(axis, value)
 
     def disarm(self) -> None:
         """Back to disarmed from any mode."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -139,6 +140,10 @@ class ControlServer:
                 return {"ok": True, "known": known, "present": present}
             case State():
                 return {"ok": True, **machine.state(), "camera_pid": self._camera.pid}
+            case VehicleState():
+                vehicle = world.vehicle
+                told = {"speed_m_per_s": vehicle.speed_m_per_s, "travelled_m": vehicle.travelled_m}
+                return {"ok": True, "time_s": time.monotonic(), **told}
             case TopView():
                 view = top_view(
                     world.field.heights_m, world.field.cell_m, world.vehicle.x_m, world.blade, self._appearance
@@ -335,6 +340,12 @@ class State(_Command):
     cmd: Literal["state"]
 
 
+class VehicleState(_Command):
+    """What the machine's own wheels tell: speed, and distance rolled, backwards counted off."""
+
+    cmd: Literal["vehicle"]
+
+
 class TopView(_Command):
     """Write a colour picture of the bed from above (PNG): up is forward, left is the operator's left."""
 
@@ -371,6 +382,7 @@ Command = Annotated[
     | ClearFaults
     | Faults
     | State
+    | VehicleState
     | TopView
     | TopDepth
     | Quit,

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import can
-
+from graderd.drivers.j1939.python_can import can
 from graderd.hal.errors import DeviceMissingError
 from graderd.simulator.camera.child import CameraChild
 from graderd.simulator.camera.shared_scene import SharedScene

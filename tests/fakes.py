@@ -1,4 +1,4 @@
-"""Devices and eyes for tests of the runtime: they obey the contracts and do at once what they are told."""
+"""Devices and eyes for tests of the runtime: they obey the contracts and do what they are told."""
 
 from __future__ import annotations
 
@@ -71,7 +71,11 @@ class FakeAxis:
         self.log.append(f"{self.name} goal {goal:.3f}")
         self.goal = goal
         if not self.stuck:
-            self.position = goal
+            self.move(goal)
+
+    def move(self, goal: float) -> None:
+        """Go there."""
+        self.position = goal
 
     def hold(self) -> None:
         self.log.append(f"{self.name} hold")
@@ -111,12 +115,38 @@ class FakeAxis:
 
 
 class FakeRotator(FakeAxis):
-    """A rotator that is where it was told to be."""
+    """A rotator that turns to where it was told with a speed of its own, as a servo does; it stops at once."""
+
+    SPEED, RENEWED_S = 25.0, 0.2
+
+    def __init__(self, name: str, clock: ManualClock, position: float, log: list[str]) -> None:
+        super().__init__(name, clock, position, log)
+        self.moved_s = clock.now_s()
+
+    def move(self, goal: float) -> None:
+        """Only time moves it."""
+
+    def turn(self) -> None:
+        """Let it have turned until now."""
+        now_s = self.clock.now_s()
+        if self.goal is not None and self.sent is not None and self.lifecycle is Lifecycle.ACTIVE and not self.stuck:
+            expires_s = self.sent.time_s + self.RENEWED_S
+            most = self.SPEED * max(0.0, min(now_s, expires_s) - self.moved_s)
+            self.position += min(most, max(-most, self.goal - self.position))
+            if now_s > expires_s:
+                self.goal = None
+        self.moved_s = now_s
+
+    def hold(self) -> None:
+        self.turn()
+        super().hold()
 
     def telemetry(self) -> RotatorTelemetry:
+        self.turn()
         return RotatorTelemetry(angle_deg=self.reading(), goal_sent_deg=self.sent, goal_deg=self.goal)
 
     def set_goal_deg(self, goal_deg: float) -> None:
+        self.turn()
         self.go(goal_deg)
 
 

@@ -18,8 +18,6 @@ from graderd.core import commands as cmd
 from graderd.core.axes import LIFTS
 from graderd.core.machine import Mode
 from graderd.core.tick import Tick
-from graderd.drivers.j1939.link import CONTROL_PERIOD_S
-from graderd.hal.settings import ElectrakSettings
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
 from graderd.runtime.state_file import StateFile
@@ -27,6 +25,8 @@ from graderd.simulator.actuators import VirtualElectrak
 from tests.electrak_sim import Machine, SimulatedLoop
 from tests.fakes import FakeActuator, FakeEyes, FakeRotator
 
+CONTROL_PERIOD_S: Final = 0.1
+"""Of the control messages on the bus."""
 RENEW_S: Final = 0.1
 LOOK_S: Final = 0.01
 KNOWN_AFTER_MM: Final = 25.0
@@ -137,10 +137,8 @@ class LiftMachine:
 async def lift_machine(clock: SimulatedLoop, seed: int = 0, config: Config | None = None) -> AsyncIterator[LiftMachine]:
     """Armed and at rest."""
     config = config or Config()
-    assert isinstance(config.lift_left, ElectrakSettings)
-    async with Machine(
-        clock, names=(*LIFTS, "spare"), seed=seed, speed_percent=config.lift_left.speed_percent
-    ) as machine:
+    speed_percent = config.lift_left.model_dump()["speed_percent"]
+    async with Machine(clock, names=(*LIFTS, "spare"), seed=seed, speed_percent=speed_percent) as machine:
         lifts = LiftMachine(clock, machine, config)
         running = asyncio.create_task(lifts.loop.run(), name="control")
         try:
@@ -199,8 +197,8 @@ def trials(moves_n: int, *, hitch: str = "", per_machine_n: int = 10, seed: int 
 
 async def run_trial(clock: SimulatedLoop, trial: Trial) -> list[Move]:
     """All moves of one machine, one after the other from where it rested."""
-    chance = random.Random(f"{trial.seed}/moves")
     moves: list[Move] = []
+    chance = random.Random(f"{trial.seed}/moves")
     async with lift_machine(clock, trial.seed) as lifts:
         for unit, factor in zip(lifts.units.values(), trial.factors, strict=True):
             unit.behaviour.speed_factor, unit.load_n = factor, trial.load_n

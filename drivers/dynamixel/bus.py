@@ -13,19 +13,31 @@ import functools
 import logging
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, Literal
 
 import serial
 
 from graderd.drivers.dynamixel import serial_port
-from graderd.drivers.dynamixel.codec import BROADCAST_ID, Instruction, Packet, StatusError, StreamDecoder, encode
+from graderd.drivers.dynamixel.codec import (
+    BROADCAST_ID,
+    MAX_ID,
+    Instruction,
+    Packet,
+    StatusError,
+    StreamDecoder,
+    encode,
+)
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import DeviceError, DeviceLostError, DeviceRefusedError, DeviceTimeoutError
 
 _ALLOWANCE_MIN_S: Final = 0.020
 _ALLOWANCE_START_S: Final = 0.060
 _ALLOWANCE_MAX_S: Final = 0.100
+_ROOM_S: Final = 0.1
+"""So long an adapter may take no bytes before the request counts as unanswered."""
+MAX_REPLY_LENGTH: Final = 96
+"""Length field of the longest reply to a request of ours, fully stuffed; a header that claims more is babble."""
 """Bounds of what a reply may take beyond wire time: scheduling at the low end, a bad USB adapter at the high one."""
 
 
@@ -71,6 +83,7 @@ class Allowance:
 
     def __init__(self) -> None:
         self.now_s = _ALLOWANCE_START_S
+        self._most_s = _ALLOWANCE_MAX_S
         self._smooth_s = 0.0
         self._spread_s = 0.0
 
@@ -80,15 +93,21 @@ class Allowance:
         self._smooth_s += 0.125 * (extra_s - self._smooth_s)
         wanted_s = self._smooth_s + 4 * self._spread_s + 0.25 * _ALLOWANCE_MIN_S
         self.now_s = min(_ALLOWANCE_MAX_S, max(_ALLOWANCE_MIN_S, wanted_s))
+        self._most_s = min(_ALLOWANCE_MAX_S, 2.0 * self.now_s)
 
     def widen(self) -> None:
-        """No reply came in time."""
-        self.now_s = min(_ALLOWANCE_MAX_S, self.now_s * 1.5)
+        """No reply came in time: at most to twice what was learned, so that losses do not eat the time for repeats."""
+        self.now_s = min(self._most_s, self.now_s * 1.5)
+
+    def late(self) -> None:
+        """A reply came after its deadline: the line is slower than what was learned."""
+        self._most_s = _ALLOWANCE_MAX_S
+        self.widen()
 
 
 log = logging.getLogger(__name__)
 
-BusLog = Callable[[float, Literal["tx", "rx"], bytes], None]
+BusTap = Callable[[float, Literal["tx", "rx"], bytes], None]
 """Called with monotonic seconds, direction and bytes of everything that crosses the wire."""
 
 _BITS_PER_BYTE: Final = 10
@@ -120,10 +139,12 @@ class ServoBus:
         port: path of the port.
         baud_n: bits per second.
         clock: monotonic seconds for the log's times.
-        bus_log: called with every chunk of bytes sent and received.
+        taps: called with every chunk of bytes sent and received; the list may change meanwhile.
         return_delay_s: the servos' Return Delay Time (factory 500 µs), part of each deadline.
 
-    ``last_valid_s``: clock time of the last valid status packet; ``unanswered_n``: requests without one since.
+    ``last_valid_s``: clock time of the last valid status packet; ``unanswered_n``: requests without one since;
+    ``heard_s``: when the servo had heard the request it answered last, which is when it measured (read it before
+    anything else is awaited).
     """
 
     def __init__(
@@ -132,32 +153,34 @@ class ServoBus:
         baud_n: int,
         *,
         clock: Clock | None = None,
-        bus_log: BusLog | None = None,
+        taps: Sequence[BusTap] = (),
         return_delay_s: float = 0.000508,
     ) -> None:
         self.port = port
         self.baud_n = baud_n
         self.low_latency = False
         self.latency_timer_ms: int | None = None
-        self.last_valid_s = float("-inf")
+        self.last_valid_s = self.heard_s = float("-inf")
         self.unanswered_n = 0
         self._clock: Clock = clock or SystemClock()
-        self._log = bus_log
+        self._taps = taps
         self._byte_s = _BITS_PER_BYTE / baud_n
         self._return_delay_s = return_delay_s
         self._serial: serial.Serial | None = None
         self._fd = -1
-        self._decoder = StreamDecoder()
+        self._decoder = StreamDecoder(MAX_REPLY_LENGTH)
         self._access = WireAccess()
         self._allowance = Allowance()
         self._reply: asyncio.Future[Packet | None] | None = None
+        self._room: asyncio.Future[None] | None = None
+        self._everybody: list[Packet] | None = None
         self._wanted_id = 0
         self._wanted_data_n: int | None = None
         self._suspect = False
         self._counters = dict.fromkeys(
             (
                 "requests_n", "replies_n", "retries_n", "timeouts_n", "refused_n", "foreign_n", "late_n", "echo_n",
-                "invalid_n", "fences_n",
+                "invalid_n", "fences_n", "damaged_requests_n", "blocked_n", "doubled_n",
             ),
             0,
         )  # fmt: skip
@@ -196,6 +219,7 @@ class ServoBus:
     def _shut(self, error: DeviceError) -> None:
         if self._fd >= 0:
             asyncio.get_running_loop().remove_reader(self._fd)
+            asyncio.get_running_loop().remove_writer(self._fd)
             self._fd = -1
         if self._serial is not None:
             opened, self._serial = self._serial, None
@@ -203,8 +227,9 @@ class ServoBus:
                 opened.close()
             except (OSError, serial.SerialException) as e:
                 log.debug("%s: closing a vanished port: %s", self.port, e)
-        if self._reply is not None and not self._reply.done():
-            self._reply.set_exception(error)
+        for waiting in (self._reply, self._room):
+            if waiting is not None and not waiting.done():
+                waiting.set_exception(error)
 
     def counters(self) -> dict[str, int]:
         """What happened on the wire since the bus was made."""
@@ -222,8 +247,8 @@ class ServoBus:
 
     @property
     def damaged_n(self) -> int:
-        """Replies that came and were not valid."""
-        return self._decoder.crc_errors_n + self._counters["invalid_n"]
+        """Packets that came damaged: replies here, requests at the servo."""
+        return self._decoder.crc_errors_n + self._counters["invalid_n"] + self._counters["damaged_requests_n"]
 
     # -- requests -----------------------------------------------------------------------------------------------
 
@@ -235,6 +260,27 @@ class ServoBus:
         """
         data = (await self.request(servo_id, Instruction.PING, b"", _PING_DATA_BYTES, attempts_n=attempts_n)).data
         return data[0] | data[1] << 8, data[2]
+
+    async def ping_all(self) -> list[tuple[int, int, int]]:
+        """Id, model number and firmware version of all that answer a broadcast ping, each in its turn."""
+        await self._access.take(False)
+        heard: list[Packet] = []
+        self._everybody = heard
+        try:
+            await self._transmit(encode(BROADCAST_ID, Instruction.PING))
+            answer_s = (_STATUS_BYTES + _PING_DATA_BYTES) * self._byte_s + self._return_delay_s
+            await asyncio.sleep(_ALLOWANCE_MAX_S + MAX_ID * answer_s)
+        finally:
+            self._everybody = None
+            self._suspect = True
+            self._access.give_back()
+        pings = [p for p in heard if len(p.data) == _PING_DATA_BYTES]
+        return [(p.packet_id, p.data[0] | p.data[1] << 8, p.data[2]) for p in pings]
+
+    async def answers_twice(self) -> bool:
+        """Whether a request so far drew two answers; waits until the second to the last one had its time."""
+        await asyncio.sleep(self._allowance.now_s)
+        return self._counters["doubled_n"] > 0
 
     async def read(self, servo_id: int, address: int, size: int, *, attempts_n: int = 2) -> Packet:
         """``size`` bytes from ``address``; the packet's ``data`` holds exactly that many, ``alert`` stands beside it.
@@ -263,9 +309,10 @@ class ServoBus:
         """Send an instruction that nobody answers (broadcasts; a servo whose status return level is unknown)."""
         await self._access.take(False)
         try:
-            self._transmit(encode(servo_id, instruction, params))
+            if servo_id != BROADCAST_ID:
+                self._suspect = True  # should it answer after all, that is not the next one's reply
+            await self._transmit(encode(servo_id, instruction, params))
             await asyncio.sleep(self._byte_s * (12 + len(params)) + self._return_delay_s)
-            self._suspect = servo_id != BROADCAST_ID  # should it answer after all, that is not the next one's reply
         finally:
             self._access.give_back()
 
@@ -282,7 +329,8 @@ class ServoBus:
         """Send an instruction and return its valid status packet.
 
         ``attempts_n`` bounds the sends; more than 1 only for what may be carried out twice (reads, absolute writes).
-        ``urgent`` requests go ahead of all others that wait, also between another one's attempts.
+        ``urgent`` requests go ahead of all others that wait, also between another one's attempts, and are sent once
+        more where it is not yet known that the line is clear: only for what may be carried out twice.
 
         Raises:
             ServoRefusedError: the servo answered with an error number.
@@ -303,6 +351,8 @@ class ServoBus:
             try:
                 if attempt:
                     self._counters["retries_n"] += 1
+                if self._suspect and urgent:
+                    await self._transmit(packet)  # a stop does not wait until the line is known to be clear
                 if self._suspect and not await self._fence(servo_id):
                     continue
                 reply = await self._exchange(packet, servo_id, reply_data_n)
@@ -313,7 +363,8 @@ class ServoBus:
             error = reply.error
             if not error:
                 return reply
-            if error == StatusError.CRC and attempt + 1 < attempts_n:
+            if error == StatusError.CRC:  # it did not understand: a lost packet, whatever is left to try
+                self._counters["damaged_requests_n"] += 1
                 continue
             self._counters["refused_n"] += 1
             raise ServoRefusedError(self._where(servo_id), _describe(packet), error)
@@ -344,9 +395,11 @@ class ServoBus:
         self._wanted_id, self._wanted_data_n = servo_id, reply_data_n
         self._reply = reply = loop.create_future()
         self._counters["requests_n"] += 1
-        started_s = loop.time()
         try:
-            self._transmit(packet)
+            if not await self._transmit(packet):
+                reply.set_result(None)
+            started_s = loop.time()
+            heard_s = self._clock.now_s() + len(packet) * self._byte_s
             timer = loop.call_at(started_s + on_wire_s + self._allowance.now_s, self._on_deadline, reply)
             try:
                 answer: Packet | None = await reply
@@ -363,6 +416,7 @@ class ServoBus:
             self._counters["timeouts_n"] += 1
             self._allowance.widen()
             return None
+        self.heard_s = min(heard_s, self._clock.now_s())
         self._allowance.learn(max(0.0, loop.time() - started_s - on_wire_s))
         return answer
 
@@ -374,22 +428,48 @@ class ServoBus:
 
     # -- bytes --------------------------------------------------------------------------------------------------
 
-    def _transmit(self, packet: bytes) -> None:
+    async def _transmit(self, packet: bytes) -> bool:
+        """Write it whole, in as many pieces as the adapter takes; False where it took no more in time."""
+        loop = asyncio.get_running_loop()
+        left, until_s = packet, loop.time() + _ROOM_S
+        while True:
+            left = left[self._write(left) :]
+            if not left:
+                break
+            self._counters["blocked_n"] += 1
+            if not await self._wait_for_room(until_s):
+                return False
+        for tap in self._taps:
+            tap(self._clock.now_s(), "tx", packet)
+        return True
+
+    def _write(self, data: bytes) -> int:
         if self._fd < 0:
             raise DeviceLostError(self.port, "the port is not open", "Check the USB cable")
         try:
-            written_n = os.write(self._fd, packet)
+            return os.write(self._fd, data)
         except BlockingIOError:
-            written_n = 0
+            return 0
         except OSError as e:
             error = DeviceLostError(self.port, f"writing failed ({e.strerror})", "Check the USB cable")
             self._reply = None  # the request learns of it here and now
             self._shut(error)
             raise error from e
-        if written_n != len(packet):
-            raise DeviceTimeoutError(self.port, "the adapter takes no more bytes", "Unplug it and plug it in again")
-        if self._log is not None:
-            self._log(self._clock.now_s(), "tx", packet)
+
+    async def _wait_for_room(self, until_s: float) -> bool:
+        loop, fd = asyncio.get_running_loop(), self._fd
+        self._room = room = loop.create_future()
+        loop.add_writer(fd, _there_is, room)
+        try:
+            async with asyncio.timeout_at(until_s):
+                await room
+        except TimeoutError:
+            return False
+        finally:
+            self._room = None
+            if self._fd == fd:
+                loop.remove_writer(fd)
+        return True
 
     def _on_readable(self) -> None:
         if self._fd < 0:
@@ -404,8 +484,8 @@ class ServoBus:
         if not data:
             self._shut(DeviceLostError(self.port, "the port vanished", "Check the USB cable"))
             return
-        if self._log is not None:
-            self._log(self._clock.now_s(), "rx", data)
+        for tap in self._taps:
+            tap(self._clock.now_s(), "rx", data)
         for packet in self._decoder.feed(data):
             self._sort(packet)
 
@@ -414,19 +494,35 @@ class ServoBus:
         counters, reply = self._counters, self._reply
         if not packet.is_status:
             counters["echo_n"] += 1
+        elif self._everybody is not None:
+            self._everybody.append(packet)
         elif reply is None or reply.done():
-            counters["late_n"] += 1
+            if packet.packet_id == self._wanted_id and not self._suspect and not self._counters["timeouts_n"]:
+                counters["doubled_n"] += 1  # nothing was ever given up that could be late
+            self._note_late()
         elif packet.packet_id != self._wanted_id:
             counters["foreign_n"] += 1
         elif self._wanted_data_n is not None and len(packet.data) != self._wanted_data_n and not packet.error:
-            counters["late_n" if self._suspect else "invalid_n"] += 1
+            if self._suspect:
+                self._note_late()
+            else:
+                counters["invalid_n"] += 1
         elif packet.error and self._suspect:
-            counters["late_n"] += 1  # a ping is never refused: this belongs to a former request
+            self._note_late()  # a ping is never refused: this belongs to a former request
         else:
             counters["replies_n"] += 1
             self.last_valid_s = self._clock.now_s()
             self.unanswered_n = 0
             reply.set_result(packet)
+
+    def _note_late(self) -> None:
+        self._counters["late_n"] += 1
+        self._allowance.late()
+
+
+def _there_is(room: asyncio.Future[None]) -> None:
+    if not room.done():
+        room.set_result(None)
 
 
 def _describe(packet: bytes) -> str:

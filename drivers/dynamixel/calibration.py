@@ -14,11 +14,16 @@ from graderd.hal.settings import Ph54Settings
 _LIMIT_MARGIN_DEG = 1.0
 """The servo's own position limits lie so far outside the soft limits, so that ours act first."""
 _DEG_PER_S_PER_REV_PER_MIN = 6.0
+_OVER_RATING = 1.5
+"""35 V, the highest supply, over the 24 V of the rating."""
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Conversions for one servo on one blade; build it with :meth:`of`."""
+    """Conversions for one servo on one blade; build it with :meth:`of`.
+
+    ``top_deg_per_s``: no output of the servo turns faster, at the highest supply voltage.
+    """
 
     zero_deg: float
     sign: int
@@ -29,6 +34,7 @@ class Calibration:
     velocity_deg_per_s_per_count: float
     acceleration_deg_per_s2_per_count: float
     torque_nm_per_a: float
+    top_deg_per_s: float
 
     @classmethod
     def of(cls, settings: Ph54Settings, table: ControlTable) -> Calibration:
@@ -46,6 +52,7 @@ class Calibration:
             velocity_deg_per_s_per_count=per_s,
             acceleration_deg_per_s2_per_count=per_s2,
             torque_nm_per_a=rating["torque_nm_per_a"],
+            top_deg_per_s=_OVER_RATING * rating["speed_no_load_rev_per_min"] * _DEG_PER_S_PER_REV_PER_MIN,
         )
 
     def blade_deg(self, counts: int) -> float:
@@ -55,6 +62,14 @@ class Calibration:
     def counts(self, blade_deg: float) -> int:
         """Position register of a blade angle."""
         return round(self.sign * (blade_deg + self.zero_deg) * self.gear_ratio * self.pulses_per_turn / 360.0)
+
+    def servo_deg(self, counts: int) -> float:
+        """Degrees at the servo's output, in its own frame, of a position register."""
+        return counts * 360.0 / self.pulses_per_turn
+
+    def servo_counts(self, servo_deg: float) -> int:
+        """Position register of degrees at the servo's output."""
+        return round(servo_deg * self.pulses_per_turn / 360.0)
 
     def blade_deg_per_s(self, counts: int) -> float:
         """Blade velocity of a velocity register."""

@@ -13,6 +13,8 @@ from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError, WrongDevi
 EXTENDED_MODE, POSITION_MODE = 4, 3
 WATCHDOG_TRIPPED = -1
 WATCHDOG_STEP_S = 0.020
+WITNESS = {"led_green": 0x47, "led_blue": 0x52}
+"""Left in the servo's RAM once its turns are known: a restart forgets it as it forgets the turns. The LED shows it."""
 _RUN_BYTES = 64
 ATTEMPTS_N = 8
 """Attempts of a request on which a whole procedure depends (opening, arming); polling has the next poll instead."""
@@ -22,8 +24,8 @@ ATTEMPTS_N = 8
 class Difference:
     """One register whose content is not what the profile says.
 
-    ``kind``: ``expected`` (judged at every start), ``range`` (outside the documented range), ``default`` (legal, but
-    not the factory's value), ``refused`` (the servo does not know the register).
+    ``kind``: ``expected`` (judged at every start), ``range`` (outside the documented range), ``refused`` (the servo
+    does not know the register): these are wrong. ``default`` is not: legal, and neither the factory's value nor ours.
     """
 
     register: str
@@ -44,6 +46,7 @@ class Ph54Device:
         telemetry = table.profile["telemetry"]
         self.telemetry_block = table.block(telemetry["first"], telemetry["last"])
         self.health_block = table.block("torque_enable", "hardware_error_status")
+        self.witness_block = table.block("led_green", "led_blue")
         self.goal_block = table.block("bus_watchdog", "goal_position")
         self.arm_block = table.block("goal_current", "goal_position")
         self.profile_block = table.block("profile_acceleration", "goal_position")
@@ -116,6 +119,12 @@ class Ph54Device:
                 f"nothing answers at {bus.baud_n} bit/s",
                 "Check the 24 V supply, the RS-485 cable, rotation.servo_id_n and rotation.baud_n",
             ) from e
+        if await bus.answers_twice():
+            raise WrongDeviceError(
+                self.where,
+                f"two servos answer to id {self.servo_id}",
+                "Leave one of them on the bus and give it another id",
+            )
         if model != table.model_number:
             raise WrongDeviceError(
                 self.where,
@@ -139,8 +148,8 @@ class Ph54Device:
         limits, _ = await self.read_block(self.table.block("velocity_limit", "shutdown"))
         return {**first, **limits}
 
-    async def verify(self, expected_mode: int) -> list[Difference]:
-        """Read every register and compare it with the profile; reads only.
+    async def verify(self, expected_mode: int, written: Mapping[str, int]) -> list[Difference]:
+        """Read every register and compare it with the profile; reads only. ``written``: what arming writes is right.
 
         Raises:
             DeviceTimeoutError, DeviceLostError: the servo stopped answering.
@@ -161,7 +170,8 @@ class Ph54Device:
         found += judge(self.table, values, firmware, expected_mode)
         judged = {d.register for d in found}
         for register in self.table.registers:
-            if register.name in values and register.name not in judged:
+            name = register.name
+            if name in values and name not in judged and values[name] != written.get(name):
                 found += _compare(self.table, register, values[register.name])
         return sorted(found, key=lambda d: d.address)
 
@@ -221,7 +231,9 @@ def _compare(table: ControlTable, register: Register, value: int) -> list[Differ
     ]
     kept = register.eeprom and (register.writable or register.name == "model_number")
     if kept and value != register.default and value not in disputed:
-        return difference("default", str(register.default), "factory value is")
+        return difference(
+            "expected" if register.name == "model_number" else "default", str(register.default), "factory value is"
+        )
     return []
 
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 from graderd.drivers.dynamixel.bus import ServoBus
 from graderd.drivers.dynamixel.calibration import Calibration
-from graderd.drivers.dynamixel.device import WATCHDOG_TRIPPED, Ph54Device
+from graderd.drivers.dynamixel.device import WATCHDOG_TRIPPED, WITNESS, Ph54Device
+from graderd.drivers.dynamixel.motion import ServoMotion, possible
 from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.clock import Clock
 from graderd.hal.fault import PresentFaults
@@ -16,6 +17,9 @@ from graderd.hal.rotator import RotatorTelemetry
 from graderd.hal.settings import Ph54Settings
 
 _CORRUPT_N, _CORRUPT_WINDOW_S = 3, 1.0
+_READS_MOST_N = 3
+_DOUBT_S = 0.1
+"""Against a reading older than this, a new one is not wrong but only not vouched for."""
 _VOLTAGE_HYSTERESIS_V = 0.3
 _TEMPERATURE_HYSTERESIS_C = 2.0
 SUPPLY_FAULTS = ("voltage_near_limit", "temperature_near_limit")
@@ -27,6 +31,9 @@ class ServoObserver:
     ``torque_on``: as last read. ``tripped``: the servo's bus watchdog has stopped it and is not cleared yet.
     ``turns_unknown``: whole turns were lost where they matter, the angle is ambiguous until a person confirms it.
     ``turns_jumped``: the turn count jumped since :meth:`restart`; a goal in counts is worth nothing any more.
+    ``witness_due``: what is still to be written where the servo keeps the witness of its turns.
+    ``motion``: the newest reading that was possible after the one before, in the servo's own frame.
+    ``implausible_n``: positions with a right CRC that could not be.
     """
 
     def __init__(
@@ -38,6 +45,9 @@ class ServoObserver:
         self.tripped = False
         self.turns_unknown = False
         self.turns_jumped = False
+        self.witness_due: dict[str, int] | None = None
+        self.motion: ServoMotion | None = None
+        self.implausible_n = 0
         self.health_s = self.goals_s = float("-inf")
         self._settings = settings
         self._calibration = calibration
@@ -54,12 +64,48 @@ class ServoObserver:
         if not position_known:
             self._counts = None
 
+    def confirm_turns(self) -> None:
+        """A person has seen that the angle is right: leave a witness of it with the servo."""
+        self.turns_unknown = False
+        self.faults.clear("turns_lost")
+        if self._calibration.needs_turns:
+            self.witness_due = dict(WITNESS)
+
     # -- readings ---------------------------------------------------------------------------------------------
 
     async def read_telemetry(self, device: Ph54Device, goal_deg: float | None, *, attempts_n: int = 1) -> None:
-        """One telemetry block; ``goal_deg`` is where the servo is driving the blade to, if anywhere."""
-        values, alert = await device.read_block(device.telemetry_block, attempts_n=attempts_n)
-        now_s, cal = self._clock.now_s(), self._calibration
+        """One telemetry block; ``goal_deg`` is where the servo is driving the blade to, if anywhere.
+
+        A position that cannot come after the last one is asked for again at once: it counts where two agree. Until
+        then the readings are the old ones, and age.
+        """
+        doubted: ServoMotion | None = None
+        for _ in range(_READS_MOST_N):
+            values, alert = await device.read_block(device.telemetry_block, attempts_n=attempts_n)
+            motion = self._motion(values, device.bus.heard_s)
+            if any(m and possible(m, motion, self._calibration.top_deg_per_s) for m in (self.motion, doubted)):
+                self.motion = motion
+                self._take(values, motion.time_s, goal_deg)
+                if alert and not self.faults.names(self._clock.now_s()) & self._alert_names:
+                    self.health_s = float("-inf")  # read it next
+                return
+            if self.motion is not None and motion.time_s - self.motion.time_s < _DOUBT_S:
+                self.implausible_n += 1
+            doubted = motion
+
+    def _motion(self, values: dict[str, int], at_s: float) -> ServoMotion:
+        cal = self._calibration
+        per_s = cal.velocity_deg_per_s_per_count
+        return ServoMotion(
+            time_s=at_s,
+            position_deg=cal.servo_deg(values["present_position"]),
+            velocity_deg_per_s=values["present_velocity"] * per_s,
+            setpoint_deg=cal.servo_deg(values["position_trajectory"]),
+            setpoint_deg_per_s=values["velocity_trajectory"] * per_s,
+        )
+
+    def _take(self, values: dict[str, int], now_s: float, goal_deg: float | None) -> None:
+        cal = self._calibration
         angle_deg = cal.blade_deg(self._follow_turns(values["present_position"], now_s))
         velocity = cal.blade_deg_per_s(values["present_velocity"])
         current_ma, volts = values["present_current"], values["present_input_voltage"] / 10.0
@@ -77,8 +123,6 @@ class ServoObserver:
             goal_deg=goal_deg,
         )
         self._watch_supply(volts, celsius, now_s)
-        if alert and not self.faults.names(now_s) & self._alert_names:
-            self.health_s = float("-inf")  # read it next
 
     def _follow_turns(self, counts: int, now_s: float) -> int:
         """Notice a jump by whole turns; returns the count to go by."""
@@ -89,6 +133,7 @@ class ServoObserver:
             detail = f"the servo's turn count jumped by {round((counts - before) / turn):+d}"
             if extended:
                 self.turns_unknown = True
+                self.witness_due = dict.fromkeys(WITNESS, 0)
                 self.faults.set("turns_lost", f"{detail}: confirm the blade's angle", now_s)
             else:
                 self.faults.tell("turns_lost", f"{detail}; the angle within one turn is known", now_s)
@@ -106,6 +151,18 @@ class ServoObserver:
         }
         self.faults.keep_only(present, now_s, among=self._alert_names)
         self.set_torque(bool(health["torque_enable"]))
+        if self._calibration.needs_turns and self.witness_due is None and not self.turns_unknown:
+            self._ask_witness(health, now_s)
+
+    def _ask_witness(self, health: dict[str, int], now_s: float) -> None:
+        """Without it the servo may have restarted since its turns were known, and lost them unseen."""
+        if all(health[name] == value for name, value in WITNESS.items()):
+            return
+        self.turns_unknown = True
+        if self.telemetry.angle_deg is not None:
+            self.telemetry = replace(self.telemetry, angle_deg=replace(self.telemetry.angle_deg, valid=False))
+        detail = "nothing proves that the servo has not restarted: compare the blade with the angle shown, then confirm"
+        self.faults.set("turns_lost", detail, now_s)
 
     async def read_goals(self, device: Ph54Device, *, attempts_n: int = 1) -> dict[str, int]:
         """Watchdog, profile and goal registers; a trip is told once, however long the register stays tripped."""
@@ -152,11 +209,11 @@ class ServoObserver:
 
     def count_damage(self, bus: ServoBus) -> None:
         """Several damaged replies within a second are a fault even where others get through."""
-        now_s, damaged_n = self._clock.now_s(), bus.damaged_n
+        now_s, damaged_n = self._clock.now_s(), bus.damaged_n + self.implausible_n
         self._damaged_s.extend([now_s] * min(max(0, damaged_n - self._damaged_n), 8))
         self._damaged_n = damaged_n
         recent_n = sum(1 for at_s in self._damaged_s if now_s - at_s <= _CORRUPT_WINDOW_S)
-        detail = f"{recent_n} damaged replies within {_CORRUPT_WINDOW_S:g} s"
+        detail = f"{recent_n} damaged or impossible replies within {_CORRUPT_WINDOW_S:g} s"
         self.faults.keep("corrupt_replies", recent_n >= _CORRUPT_N, detail, now_s)
 
     def damaged_lately(self) -> bool:
@@ -165,5 +222,5 @@ class ServoObserver:
 
     def new_wire(self) -> None:
         """The damage of another connection does not count."""
-        self._damaged_n = 0
+        self._damaged_n = self.implausible_n
         self._damaged_s.clear()

@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 
 from graderd.drivers.dynamixel import arming
-from graderd.drivers.dynamixel.bus import BusLog
+from graderd.drivers.dynamixel.bus import BusTap
 from graderd.drivers.dynamixel.calibration import Calibration
-from graderd.drivers.dynamixel.connection import ServoLink, condition_of
+from graderd.drivers.dynamixel.connection import Found, ServoLink, condition_of
 from graderd.drivers.dynamixel.device import EXTENDED_MODE, POSITION_MODE, Difference
 from graderd.drivers.dynamixel.observer import ServoObserver
 from graderd.drivers.dynamixel.serial_port import ListPorts, system_ports
 from graderd.drivers.dynamixel.servo_task import DEVICE, FIELDS, LINK_FAULTS, CommandSlot, ServoTask
+from graderd.drivers.dynamixel.states import Event
 from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import (
@@ -44,7 +46,6 @@ class Ph54Rotator:
     Args:
         settings: port, calibration, limits, timeouts.
         clock: monotonic seconds for readings and goal timeouts.
-        bus_log: called with all bytes on the wire, for the recorder.
         list_ports: lists serial ports; for finding the adapter by USB serial number.
     """
 
@@ -52,7 +53,6 @@ class Ph54Rotator:
         self,
         settings: Ph54Settings,
         clock: Clock | None = None,
-        bus_log: BusLog | None = None,
         *,
         list_ports: ListPorts = system_ports,
     ) -> None:
@@ -61,7 +61,7 @@ class Ph54Rotator:
         self.calibration = Calibration.of(settings, self.table)
         self._mode = EXTENDED_MODE if self.calibration.needs_turns else POSITION_MODE
         self._clock: Clock = clock or SystemClock()
-        self._link = ServoLink(settings, self.table, self._mode, self._clock, bus_log, list_ports)
+        self._link = ServoLink(settings, self.table, self._mode, self._clock, list_ports)
         self._observer = ServoObserver(DEVICE, settings, self.table, self.calibration, self._clock)
         self._command = CommandSlot(settings, self.calibration)
         self._keeper = ServoTask(settings, self._link, self._observer, self._command, self._clock)
@@ -85,12 +85,17 @@ class Ph54Rotator:
 
     def telemetry(self) -> RotatorTelemetry:
         """Newest readings, each with its time; ``counters`` tell the wire's history."""
-        return replace(self._observer.telemetry, counters=self._link.counters())
+        counters = {**self._link.counters(), "implausible_n": self._observer.implausible_n}
+        return replace(self._observer.telemetry, counters=counters)
 
     def faults(self) -> tuple[DeviceFault, ...]:
         """Conditions present now. Events (trips, lost turns) stay visible for a second after they happened."""
-        present, slow = self._observer.faults.present(self._clock.now_s()), self._link.slow_adapter
-        return present if slow is None else (*present, slow)
+        present = self._observer.faults.present(self._clock.now_s())
+        return (*present, *(fault for fault in (self._link.slow_adapter, self._link.lossy) if fault is not None))
+
+    def tap(self, listener: BusTap) -> Callable[[], None]:
+        """Call ``listener`` with all bytes on the wire, whoever sent them; returns the call that ends it."""
+        return self._link.tap(listener)
 
     async def wait_telemetry(self) -> RotatorTelemetry:
         """The next telemetry, as soon as it was read (or the connection's state changed)."""
@@ -106,13 +111,14 @@ class Ph54Rotator:
         self._keeper.torque_is_ours = False
         self._command.forget()
         try:
-            await self._keeper.connect()
+            async with self._keeper.turn:
+                await self._keeper.connect()
         except BaseException as e:
             self._link.disconnect()
             if isinstance(e, DeviceError):
                 self._observer.faults.set(condition_of(e), e.cause, self._clock.now_s())
             raise
-        self._keeper.lifecycle = Lifecycle.STANDBY
+        self._keeper.note(Event.OPENED)
         self._keeper.start()
 
     async def arm(self) -> None:
@@ -126,16 +132,16 @@ class Ph54Rotator:
             self._require(Lifecycle.STANDBY)
             device = self._link.device
             self._keeper.torque_is_ours = True
-            counts = await arming.power_up(device, self.settings, self.calibration)
+            armed = await arming.power_up(device, self.settings, self.calibration)
             if self._keeper.lifecycle is not Lifecycle.STANDBY:  # closed in the meantime
                 await device.torque(False)
                 raise LifecycleError(DEVICE, f"became {self._keeper.lifecycle} while it was being armed")
-            self._command.forget(counts)
-            self._observer.note_sent(counts)
+            self._command.armed(armed)
+            self._observer.note_sent(armed.goal_counts)
             self._observer.restart()
             self._observer.set_torque(True)
             self._observer.tripped = False
-            self._keeper.lifecycle = Lifecycle.ACTIVE
+            self._keeper.note(Event.ARMED)
 
     def set_goal_deg(self, goal_deg: float) -> None:
         """Take a new goal; sent at once by the driver's own task. See :meth:`graderd.hal.rotator.Rotator`."""
@@ -151,7 +157,7 @@ class Ph54Rotator:
         self._keeper.wake()
 
     def hold(self) -> None:
-        """Stop where the blade is: goal := measured with the next packet. Allowed in every state, idempotent."""
+        """Stop with the next packet, as soon as the blade can without turning back. Allowed always, idempotent."""
         self._command.hold()
         self._keeper.wake()
 
@@ -159,14 +165,15 @@ class Ph54Rotator:
         """active -> standby: hold, come to rest, then torque as ``torque_at_disarm`` says. Elsewhere: nothing to do."""
         if self._keeper.lifecycle is not Lifecycle.ACTIVE:
             return
-        self._keeper.lifecycle = Lifecycle.STANDBY
+        self._keeper.note(Event.DISARMED)
         await self._keeper.power_down(off=self.settings.torque_at_disarm == "off")
 
     async def close(self) -> None:
         """Any state -> closed: torque as ``torque_at_exit`` says where it was switched on by us, then let go."""
         if self._keeper.lifecycle is Lifecycle.CLOSED:
             return
-        was, self._keeper.lifecycle = self._keeper.lifecycle, Lifecycle.CLOSED
+        was = self._keeper.lifecycle
+        self._keeper.note(Event.CLOSED)
         if was is not Lifecycle.FAILED and self._keeper.torque_is_ours and self._observer.torque_on:
             try:
                 async with asyncio.timeout(_CLOSE_S):
@@ -186,7 +193,7 @@ class Ph54Rotator:
         self._require(Lifecycle.STANDBY)
         async with self._keeper.turn:
             self._require(Lifecycle.STANDBY)
-            self._keeper.lifecycle = Lifecycle.FAILED
+            self._keeper.note(Event.LOST)
             self._keeper.torque_is_ours = False
             try:
                 await self._link.reboot()
@@ -196,24 +203,38 @@ class Ph54Rotator:
                 if self._link.bus is not None:
                     self._link.bus.close()  # the servo task finds the line closed and starts anew
                 raise
-            if self._keeper.lifecycle is Lifecycle.FAILED:
-                self._keeper.lifecycle = Lifecycle.STANDBY
+            self._keeper.note(Event.FOUND)
 
     async def verify_profile(self) -> list[Difference]:
-        """Read every register and compare it with the firmware profile; reads only, in every open state.
+        """Read every register and compare it with the firmware profile and what arming writes; reads only.
+
+        In every state: a servo that was refused for its settings is the one that has to be looked at.
 
         Raises:
-            LifecycleError: closed or lost.
-            DeviceTimeoutError, DeviceLostError: the servo stopped answering.
+            DeviceMissingError, DeviceTimeoutError, DeviceLostError: the servo cannot be reached.
         """
-        if self._keeper.lifecycle not in (Lifecycle.STANDBY, Lifecycle.ACTIVE):
-            raise LifecycleError(DEVICE, f"cannot read the servo while {self._keeper.lifecycle}", "Check the wire")
-        return await self._link.device.verify(self._mode)
+        written = arming.eeprom_counts(self.settings, self.calibration)
+        if self._link.is_up:  # polling goes on between the reads
+            return await self._link.device.verify(self._mode, written)
+        async with self._keeper.turn, self._link.visit() as device:
+            return await device.verify(self._mode, written)
+
+    async def scan(self) -> list[Found]:
+        """Every servo on the wire, at every baud rate; the servo in use is lost for that long and found again.
+
+        Raises:
+            LifecycleError: active.
+            DeviceMissingError: there is no port.
+        """
+        if self._keeper.lifecycle is Lifecycle.ACTIVE:
+            raise LifecycleError(DEVICE, "cannot look for others while it is armed", "Disarm first")
+        async with self._keeper.turn:
+            self._keeper.note(Event.LOST)
+            return await self._link.scan()
 
     def confirm_turns(self) -> None:
         """The operator says that the angle shown is the blade's: whole turns are known again."""
-        self._observer.turns_unknown = False
-        self._observer.faults.clear("turns_lost")
+        self._observer.confirm_turns()
 
     def _require(self, state: Lifecycle) -> None:
         if self._keeper.lifecycle is not state:

@@ -1,108 +1,67 @@
-"""Make the servo safe when the daemon is dead: one synchronous function, no event loop, no state."""
+"""Make the servo safe when the daemon is dead: the driver's own client, for as long as one or two exchanges take."""
 
 from __future__ import annotations
 
-import contextlib
-import os
-import select
-import time
+import asyncio
 
-import serial
-
+from graderd.drivers.dynamixel.bus import ServoBus
 from graderd.drivers.dynamixel.calibration import Calibration
-from graderd.drivers.dynamixel.codec import Instruction, Packet, StreamDecoder, encode
-from graderd.drivers.dynamixel.serial_port import ListPorts, find_port, open_port, system_ports
+from graderd.drivers.dynamixel.device import Ph54Device
+from graderd.drivers.dynamixel.observer import ServoObserver
+from graderd.drivers.dynamixel.serial_port import ListPorts, find_port, system_ports
+from graderd.drivers.dynamixel.servo_task import DEVICE, CommandSlot
 from graderd.drivers.dynamixel.table import ControlTable
+from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceTimeoutError
 from graderd.hal.settings import Ph54Settings
 
-_REPLY_S = 0.1
-_ATTEMPTS_N = 3
+_ATTEMPTS_N = 5
 
 
 def safe_off(settings: Ph54Settings, *, list_ports: ListPorts = system_ports) -> str:
     """Bring the blade servo into the state ``torque_at_exit`` asks for, and leave. Blocks for a second at most.
 
-    ``off``: torque off. ``on``: goal := measured with torque left as it is, bus watchdog off duty, so that the servo
-    holds without anybody. Returns one line that says what was done, for the log.
+    ``off``: torque off. ``on``: hold with torque left as it is, bus watchdog off duty, so that the servo holds without
+    anybody. Returns one line that says what was done, for the log. Not from within an event loop.
 
     Raises:
         DeviceMissingError: no such port, or somebody else (a living daemon) holds it.
-        DeviceTimeoutError: the servo does not answer; the write was sent three times nevertheless.
+        DeviceTimeoutError: the servo does not answer; the write was sent several times nevertheless.
+        DeviceRefusedError: it answers and refuses.
     """
+    return asyncio.run(_safe_off(settings, list_ports))
+
+
+async def _safe_off(settings: Ph54Settings, list_ports: ListPorts) -> str:
     table = ControlTable.load(settings.profile)
-    port = find_port(settings.port, settings.usb_serial_number, list_ports)
-    opened = open_port(port, settings.baud_n)
+    bus = ServoBus(find_port(settings.port, settings.usb_serial_number, list_ports), settings.baud_n)
+    bus.open()
+    device = Ph54Device(bus, table, settings.servo_id_n)
     try:
-        wire = _Wire(opened, settings.servo_id_n)
-        if settings.torque_at_exit == "off":
-            done = wire.write(table, "torque_enable", 0)
-            text = "torque switched off"
-        else:
-            done = wire.hold(table, Calibration.of(settings, table))
-            text = "holding where it stands, torque left as it was"
+        if settings.torque_at_exit == "on":
+            await _hold(device, settings)
+            return f"{DEVICE}: holding where it stands, torque left as it was"
+        await device.write("torque_enable", 0, attempts_n=_ATTEMPTS_N, urgent=True)
+    except DeviceTimeoutError as e:
+        raise DeviceTimeoutError(device.where, "no answer to the safe-off write", "Cut the 24 V supply") from e
     finally:
-        with contextlib.suppress(OSError, serial.SerialException):
-            opened.close()
-    if not done:
-        raise DeviceTimeoutError(
-            f"servo {settings.servo_id_n} at {port}", "no answer to the safe-off write", "Cut the 24 V supply"
-        )
-    return f"rotation: {text}"
+        bus.close()
+    return f"{DEVICE}: torque switched off"
 
 
-class _Wire:
-    """Blocking request and reply on an open port."""
-
-    def __init__(self, opened: serial.Serial, servo_id: int) -> None:
-        self._fd = opened.fileno()
-        self._servo_id = servo_id
-        os.set_blocking(self._fd, False)
-
-    def write(self, table: ControlTable, name: str, value: int) -> bool:
-        """Write a register until the servo says yes; whether it did."""
-        register = table[name]
-        params = register.address.to_bytes(2, "little") + register.encode(value)
-        return self._ask(Instruction.WRITE, params, 0) is not None
-
-    def read(self, table: ControlTable, name: str) -> int | None:
-        """Read a register; None without a valid answer."""
-        register = table[name]
-        params = register.address.to_bytes(2, "little") + register.size.to_bytes(2, "little")
-        packet = self._ask(Instruction.READ, params, register.size)
-        return register.decode(packet.data) if packet is not None else None
-
-    def hold(self, table: ControlTable, calibration: Calibration) -> bool:
-        """Goal := measured. A tripped watchdog holds already and refuses goals: then only that is left to be."""
-        measured = self.read(table, "present_position")
-        if measured is None:
-            return False
-        low, high = calibration.servo_limits()
-        held = self.write(table, "goal_position", max(low, min(high, measured)))
-        return self.write(table, "bus_watchdog", 0) if held else self.read(table, "bus_watchdog") == -1
-
-    def _ask(self, instruction: int, params: bytes, data_n: int) -> Packet | None:
-        request = encode(self._servo_id, instruction, params)
-        for _ in range(_ATTEMPTS_N):
-            decoder = StreamDecoder()
-            with contextlib.suppress(BlockingIOError):
-                os.read(self._fd, 4096)
-            try:
-                os.write(self._fd, request)
-            except OSError:
-                return None
-            until_s = time.monotonic() + _REPLY_S
-            while (left_s := until_s - time.monotonic()) > 0:
-                if not select.select([self._fd], [], [], left_s)[0]:
-                    break
-                try:
-                    data = os.read(self._fd, 4096)
-                except OSError:
-                    return None
-                if not data:
-                    return None
-                for packet in decoder.feed(data):
-                    fits = packet.is_status and packet.packet_id == self._servo_id and not packet.error
-                    if fits and len(packet.data) == data_n:
-                        return packet
-        return None
+async def _hold(device: Ph54Device, settings: Ph54Settings) -> None:
+    """A tripped watchdog holds already, refuses goals, and stays as it is."""
+    calibration, clock = Calibration.of(settings, device.table), SystemClock()
+    observer, command = (
+        ServoObserver(DEVICE, settings, device.table, calibration, clock),
+        CommandSlot(settings, calibration),
+    )
+    goals = await observer.read_goals(device, attempts_n=_ATTEMPTS_N)
+    if observer.tripped:
+        return
+    await observer.read_telemetry(device, None, attempts_n=_ATTEMPTS_N)
+    if observer.motion is None:
+        raise DeviceTimeoutError(device.where, "no two readings of the angle agree", "Cut the 24 V supply")
+    command.forget(goals["goal_position"])
+    await command.send_hold(device, observer.motion, clock.now_s(), attempts_n=_ATTEMPTS_N)
+    await device.write("bus_watchdog", 0, attempts_n=_ATTEMPTS_N)

@@ -14,11 +14,18 @@ from graderd.drivers.dynamixel.calibration import Calibration
 from graderd.drivers.dynamixel.codec import StatusError
 from graderd.drivers.dynamixel.connection import ServoLink, condition_of
 from graderd.drivers.dynamixel.device import ATTEMPTS_N, Ph54Device
+from graderd.drivers.dynamixel.motion import ServoMotion, rest_deg
 from graderd.drivers.dynamixel.observer import SUPPLY_FAULTS, ServoObserver
+from graderd.drivers.dynamixel.states import Event, after
 from graderd.hal.clock import Clock
-from graderd.hal.errors import DeviceError, DeviceLostError, DeviceTimeoutError
+from graderd.hal.errors import DeviceError, DeviceLostError, DeviceRefusedError, DeviceTimeoutError, LifecycleError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import Ph54Settings
+
+log = logging.getLogger(__name__)
+
+DEVICE = "rotation"
+FIELDS = {"device": DEVICE}
 
 
 class CommandSlot:
@@ -30,11 +37,16 @@ class CommandSlot:
     def __init__(self, settings: Ph54Settings, calibration: Calibration) -> None:
         self.goal_deg: float | None = None
         self.hold_wanted = False
+        self.hold_acceleration_counts = arming.hold_acceleration_counts(settings, calibration)
         self._goal_s = -math.inf
         self._settings = settings
-        self._calibration = calibration
+        self.calibration = calibration
         self._sent_counts: int | None = None
-        self._braking = False
+        self._held_deg: float | None = None
+        self._held_s = -math.inf
+        self._holding = False
+        self._hard_profile = False
+        self._taken = False
 
     def goal(self, goal_deg: float, now_s: float) -> None:
         """The newest goal wins, also over a hold that has not gone out yet."""
@@ -42,54 +54,97 @@ class CommandSlot:
 
     def hold(self) -> None:
         """Hold with the next packet; nothing to do where the last thing sent was a hold."""
-        if self.goal_deg is None and self._braking and not self.hold_wanted:
+        if self.goal_deg is None and self._holding and not self.hold_wanted:
             return
         self.goal_deg, self.hold_wanted = None, True
 
     def forget(self, sent_counts: int | None = None) -> None:
-        """No command in force; ``sent_counts``: the goal that arming has left on the servo."""
-        self.goal_deg, self.hold_wanted, self._braking = None, False, False
-        self._sent_counts = sent_counts
+        """No command in force; ``sent_counts``: the goal that is on the servo, where that is known."""
+        self.goal_deg, self.hold_wanted, self._holding = None, False, False
+        self._sent_counts, self._held_deg = sent_counts, None
+
+    def armed(self, armed: arming.Armed) -> None:
+        """Begin anew with what arming has left on the servo."""
+        self.forget(armed.goal_counts)
+        self._hard_profile, self.hold_acceleration_counts = False, armed.hold_acceleration_counts
 
     @property
     def holding(self) -> bool:
         """Whether the last thing sent was a hold."""
-        return self._braking
+        return self._holding
+
+    @property
+    def sent_counts(self) -> int | None:
+        """The goal that the servo has, or may have."""
+        return self._sent_counts
 
     def expired(self, now_s: float) -> bool:
         """Whether the goal was not renewed in time."""
         return self.goal_deg is not None and now_s - self._goal_s > self._settings.goal_timeout_s
 
-    async def send_hold(self, device: Ph54Device, measured_deg: float) -> int:
-        """Goal := measured with a harder profile, in one packet. Returns the counts sent."""
-        low, high = self._calibration.servo_limits()
-        counts = max(low, min(high, self._calibration.counts(measured_deg)))  # beyond them the servo would refuse
-        profile = arming.profile_counts(self._settings, self._calibration, arming.HOLD_ACCELERATION_FACTOR)
-        await device.write_block(device.profile_block, {**profile, "goal_position": counts}, attempts_n=1, urgent=True)
-        self._braking, self.hold_wanted, self._sent_counts = True, False, counts
+    def sent_hold_after(self, motion: ServoMotion) -> bool:
+        """Whether a hold went out after that reading: the blade may brake since, and the reading not know of it."""
+        return self._held_deg is not None and motion.time_s < self._held_s
+
+    async def send_hold(self, device: Ph54Device, motion: ServoMotion, now_s: float, *, attempts_n: int = 1) -> int:
+        """The goal where it comes to rest soonest, with a harder profile, in one packet. Returns the counts sent.
+
+        A servo that refuses the profile still gets the goal, and brakes with the profile it has. Where a former hold
+        went unanswered and no newer reading tells whether it was taken, the same goal is sent again.
+
+        Raises:
+            ServoRefusedError: it refuses the goal too.
+            DeviceRefusedError: its count is so far outside its limits that no goal would hold it.
+        """
+        profile = arming.profile_counts(self._settings, self.calibration)
+        gentle, hard = profile["profile_acceleration"], self.hold_acceleration_counts
+        try:
+            counts = self._rest_counts(motion, now_s, hard)
+            values = {**profile, "profile_acceleration": hard, "goal_position": counts}
+            self._hard_profile = True
+            await device.write_block(device.profile_block, values, attempts_n=attempts_n, urgent=True)
+        except ServoRefusedError as e:
+            self._held_deg, self._hard_profile = None, False
+            if e.error == StatusError.DATA_RANGE:  # its watchdog has tripped: it brakes by itself
+                raise
+            counts = self._rest_counts(motion, now_s, gentle)
+            await device.write("goal_position", counts, attempts_n=attempts_n, urgent=True)
+        self._holding, self.hold_wanted = True, False
+        return counts
+
+    def _rest_counts(self, motion: ServoMotion, now_s: float, acceleration_counts: int) -> int:
+        cal = self.calibration
+        braking = acceleration_counts * cal.acceleration_deg_per_s2_per_count
+        goal_deg = None if self._sent_counts is None else cal.servo_deg(self._sent_counts)
+        if self._held_deg is None or not self.sent_hold_after(motion):
+            self._held_deg, self._held_s = rest_deg(motion, now_s, braking, goal_deg, self._held_deg), now_s
+        wanted = cal.servo_counts(self._held_deg)
+        low, high = cal.servo_limits()
+        counts = max(low, min(high, wanted))  # beyond them the servo would refuse
+        if abs(counts - wanted) > cal.pulses_per_turn // 4:
+            cause = f"it stands {cal.servo_deg(wanted - counts):+.0f}° outside its limits"
+            raise DeviceRefusedError(DEVICE, cause, "Its turns were lost: reboot it")
         return counts
 
     async def send_goal(self, device: Ph54Device) -> int | None:
         """The goal, where the servo has not got it yet. Returns the counts sent, None where nothing was to send."""
         if self.goal_deg is None:
             return None
-        counts = self._calibration.counts(self.goal_deg)
-        if self._braking:
-            profile = arming.profile_counts(self._settings, self._calibration)
+        counts = self.calibration.counts(self.goal_deg)
+        former, self._held_deg = self._sent_counts, None
+        if self._hard_profile:
+            profile = arming.profile_counts(self._settings, self.calibration)
+            self._sent_counts = counts
             await device.write_block(device.profile_block, {**profile, "goal_position": counts}, attempts_n=1)
-            self._braking = False
-        elif counts != self._sent_counts:
+        elif counts != former or not self._taken or self._holding:
+            self._sent_counts, self._taken = counts, False
             await device.write("goal_position", counts, attempts_n=1)
         else:
             return None
-        self._sent_counts = counts
+        self._hard_profile, self._holding, self._taken = False, False, True
         return counts
 
 
-log = logging.getLogger(__name__)
-
-DEVICE = "rotation"
-FIELDS = {"device": DEVICE}
 LINK_FAULTS = ("no_reply", "corrupt_replies", "unplugged", "wrong_device")
 """Conditions that end when the servo is found again."""
 _HEALTH_EVERY_S = 0.1
@@ -99,28 +154,34 @@ _RECONNECT_MOST_S = 1.0
 _RUNAWAY_DEG = 8.0
 """Braking from the fastest permitted turn takes 5.2 degrees. A blade that goes further under a hold is not braking: its
 servo runs the wrong way, and a goal, even that of staying, only drives it on."""
+_STILL_DEG_PER_S = 1.0
+_AWAY_DEG = 0.5
 _STOP_S = 0.5
 """A disarm gives the blade so long to come to rest before torque goes off."""
 _STILL_READS_N = 5
 """So many reads in a row without movement are rest; one alone may be a turning point."""
-_UNANSWERED_N = 3
-"""A lost servo left at least so many requests unanswered: a program that stood still asked none."""
+_UNANSWERED_N = 7
+"""A lost servo left so many requests in a row unanswered. Where one exchange in seven is lost that happens once in
+700,000; a program that stood still asked none."""
+_OLD_S = 0.15
+"""A hold reads the angle again where the last reading is older; a younger one tells well enough where the blade is."""
 
 
 class ServoTask:
     """Keeps one servo in the state it should be in, poll by poll, whatever the wire does.
 
-    ``lifecycle``: the rotator's, set by it and by what happens here. ``torque_is_ours``: torque was switched on by us.
+    ``torque_is_ours``: torque was switched on by us.
     ``turn``: held by whoever has several exchanges to make that belong together.
     """
 
     def __init__(
         self, settings: Ph54Settings, link: ServoLink, observer: ServoObserver, command: CommandSlot, clock: Clock
     ) -> None:
-        self.lifecycle = Lifecycle.CLOSED
+        self._state = Lifecycle.CLOSED
         self.torque_is_ours = False
         self.turn = asyncio.Lock()
         self._settings = settings
+        self._calibration = command.calibration
         self._link = link
         self._observer = observer
         self._command = command
@@ -129,6 +190,15 @@ class ServoTask:
         self._wake = asyncio.Event()
         self._readers: list[asyncio.Future[None]] = []
         self._powering_down = False
+
+    @property
+    def lifecycle(self) -> Lifecycle:
+        """Where the servo is in its life."""
+        return self._state
+
+    def note(self, event: Event) -> None:
+        """Something happened to it."""
+        self._state = after(self._state, event)
 
     def start(self) -> None:
         """Begin to poll."""
@@ -151,7 +221,13 @@ class ServoTask:
         self._wake.set()
 
     async def next_poll(self) -> None:
-        """Wait until telemetry was read, or the connection's state changed."""
+        """Wait until telemetry was read, or the connection's state changed.
+
+        Raises:
+            LifecycleError: closed: there will be none.
+        """
+        if self._state is Lifecycle.CLOSED:
+            raise LifecycleError(DEVICE, "there is no telemetry while it is closed", "Open it first")
         reader: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._readers.append(reader)
         await reader
@@ -177,18 +253,33 @@ class ServoTask:
         await observer.read_telemetry(device, None, attempts_n=ATTEMPTS_N)
         if self.torque_is_ours and not observer.torque_on:
             observer.name_torque_loss(goals)
+        self._command.forget(goals["goal_position"])
         await self._make_safe(device)
 
     async def _make_safe(self, device: Ph54Device) -> None:
-        """Torque that we had switched on goes where ``torque_at_disarm`` says. A stranger's torque is left alone."""
+        """Nothing drives the blade on; torque that we had switched on goes where ``torque_at_disarm`` says.
+
+        A stranger's torque is left alone, and so is a servo that stands; one on its way somewhere holds first.
+        """
         observer = self._observer
-        self._command.forget()
-        if self.torque_is_ours and observer.torque_on and self._settings.torque_at_disarm == "off":
+        self._command.forget(self._command.sent_counts)
+        off = self.torque_is_ours and self._settings.torque_at_disarm == "off"
+        if observer.torque_on and self._on_its_way():
+            await self._come_to_rest(device, off=off, wait=off)
+        if observer.torque_on and off:
             await self._torque_off(device)
         self.torque_is_ours = self.torque_is_ours and observer.torque_on
         if observer.tripped and not observer.torque_on:  # unpowered, no stale goal can come alive
             await device.write("bus_watchdog", 0)
             observer.tripped = False
+
+    def _on_its_way(self) -> bool:
+        """Whether the servo moves, or has a goal elsewhere than where it stands."""
+        motion, sent = self._observer.motion, self._command.sent_counts
+        if motion is None:
+            return False
+        away_deg = 0.0 if sent is None else abs(self._calibration.servo_deg(sent) - motion.position_deg)
+        return abs(motion.velocity_deg_per_s) > _STILL_DEG_PER_S or away_deg > _AWAY_DEG
 
     async def _torque_off(self, device: Ph54Device) -> None:
         await device.torque(False)
@@ -207,25 +298,42 @@ class ServoTask:
     async def _power_down_in_turn(self, *, off: bool, leaving: bool) -> None:
         async with self.turn:
             device = self._link.device
-            self._command.hold()
-            loop = asyncio.get_running_loop()
-            until_s, still_n = loop.time() + _STOP_S, 0
-            began = None  # where the blade was when the servo had taken the hold, which a bad line may delay
-            while loop.time() < until_s and still_n < _STILL_READS_N:
-                await self._tolerant(self._send_command(device))
-                await self._tolerant(self._observer.read_telemetry(device, None))
-                speed, angle = self._observer.telemetry.velocity_deg_per_s, self._observer.telemetry.angle_deg
-                still_n = still_n + 1 if speed is not None and abs(speed.value) < 1.0 else 0
-                if began is None and not self._command.hold_wanted:
-                    began = angle
-                if off and began is not None and angle is not None and abs(angle.value - began.value) > _RUNAWAY_DEG:
-                    log.warning("%s: does not obey the hold: torque off without waiting for rest", DEVICE, extra=FIELDS)
-                    break
+            await self._come_to_rest(device, off=off, wait=True)
             if off:
                 await self._torque_off(device)
                 self.torque_is_ours = False
             elif leaving:
                 await device.write("bus_watchdog", 0)
+
+    async def _come_to_rest(self, device: Ph54Device, *, off: bool, wait: bool) -> None:
+        """Hold, and wait for rest where asked; a servo whose watchdog has tripped brakes by itself.
+
+        ``off``: torque goes off afterwards, and sooner where the hold is not obeyed or refused.
+        """
+        observer, loop = self._observer, asyncio.get_running_loop()
+        until_s, still_n = loop.time() + _STOP_S, 0
+        began = None  # where the blade was when the servo had taken the hold, which a bad line may delay
+        if not observer.tripped:
+            self._command.hold()
+        while loop.time() < until_s and still_n < _STILL_READS_N:
+            try:
+                if self._command.hold_wanted:
+                    await self._tolerant(self._hold(device))
+            except DeviceRefusedError as e:
+                log.warning("%s: %s", DEVICE, e, extra=FIELDS)
+                self._command.forget(self._command.sent_counts)
+                if off:
+                    break
+            if not wait and not self._command.hold_wanted:
+                break
+            await self._tolerant(observer.read_telemetry(device, None))
+            speed, angle = observer.telemetry.velocity_deg_per_s, observer.telemetry.angle_deg
+            still_n = still_n + 1 if speed is not None and abs(speed.value) < 1.0 else 0
+            if began is None and not self._command.hold_wanted:
+                began = angle
+            if off and began is not None and angle is not None and abs(angle.value - began.value) > _RUNAWAY_DEG:
+                log.warning("%s: does not obey the hold: torque off without waiting for rest", DEVICE, extra=FIELDS)
+                break
 
     # -- the servo's own task ---------------------------------------------------------------------------------
 
@@ -239,13 +347,13 @@ class ServoTask:
 
     async def _run(self) -> None:
         pause_s = _RECONNECT_FIRST_S
-        while True:
+        while self._state is not Lifecycle.CLOSED:
             try:
                 if not self._link.is_up:
                     self._link.disconnect()
                     async with self.turn:
                         await self.connect()
-                        self.lifecycle = Lifecycle.STANDBY
+                        self.note(Event.FOUND)
                     self._link.happened["reconnects_n"] += 1
                     port = self._link.bus.port if self._link.bus else "?"
                     log.info("%s: servo found at %s", DEVICE, port, extra=FIELDS)
@@ -267,7 +375,7 @@ class ServoTask:
         # At every attempt: the log repeats it ever more rarely.
         log.warning("%s: %s", condition, error, extra={**FIELDS, "fault": f"{DEVICE}.{condition}"})
         faults.clear(*(c for c in LINK_FAULTS if c != condition), *SUPPLY_FAULTS)
-        self.lifecycle = Lifecycle.FAILED
+        self.note(Event.LOST)
         self._command.forget()
         self._link.disconnect()
         self._tell_readers()
@@ -287,6 +395,8 @@ class ServoTask:
             async with self.turn:
                 await self._cycle(self._link.device)
             next_s = max(next_s + period_s, loop.time())
+            if self._link.silence()[1]:
+                next_s = loop.time()  # a lost packet is asked for again at once
             await self._until(next_s)
 
     async def _until(self, next_s: float) -> None:
@@ -313,6 +423,8 @@ class ServoTask:
         await self._tolerant(self._send_command(device))
         await self._tolerant(observer.read_telemetry(device, self._standing_goal_deg()))
         self._tell_readers()
+        if observer.witness_due is not None:
+            await self._tolerant(self._leave_witness(device))
         if now_s - observer.health_s >= _HEALTH_EVERY_S:
             await self._tolerant(self._send_command(device))
             await self._tolerant(observer.read_health(device))
@@ -322,6 +434,13 @@ class ServoTask:
         await self._tolerant(self._protect(device))
         if self._link.bus is not None:
             observer.count_damage(self._link.bus)
+            self._link.judge_loss()
+
+    async def _leave_witness(self, device: Ph54Device) -> None:
+        """The servo's RAM shall say whether its turns are known."""
+        if (due := self._observer.witness_due) is not None:
+            await device.write_block(device.witness_block, due)
+            self._observer.witness_due = None
 
     def _standing_goal_deg(self) -> float | None:
         """Where the servo drives the blade to; None while it is not powered by us, or was told to hold."""
@@ -356,7 +475,7 @@ class ServoTask:
             await self._make_safe(device)
 
     async def _end_active(self, device: Ph54Device, condition: str = "", detail: str = "") -> None:
-        self.lifecycle = Lifecycle.STANDBY
+        self.note(Event.DISARMED)
         if condition:
             self._observer.faults.tell(condition, detail, self._clock.now_s())
         await self._make_safe(device)
@@ -378,28 +497,32 @@ class ServoTask:
         command, observer, sent = self._command, self._observer, None
         try:
             if command.hold_wanted:
-                angle = observer.telemetry.angle_deg
-                if not observer.torque_on or angle is None:
-                    command.forget()  # nothing is powered: nothing to hold
-                    return
-                if not angle.is_fresh(self._clock.now_s(), self._settings.reply_timeout_s):
-                    await observer.read_telemetry(device, None)
-                    angle = observer.telemetry.angle_deg or angle
-                sent = await command.send_hold(device, angle.value)
+                await self._hold(device)
             elif self.lifecycle is Lifecycle.ACTIVE:
                 sent = await command.send_goal(device)
-        except ServoRefusedError as e:
+        except DeviceRefusedError as e:
             await self._on_refusal(device, e)
         if sent is not None:
             observer.note_sent(sent)
 
-    async def _on_refusal(self, device: Ph54Device, error: ServoRefusedError) -> None:
+    async def _hold(self, device: Ph54Device) -> None:
+        """Send the hold, by a reading as young as can be had."""
+        command, observer = self._command, self._observer
+        if not observer.torque_on or observer.motion is None:
+            command.forget()  # nothing is powered: nothing to hold
+            return
+        too_old = self._clock.now_s() - observer.motion.time_s > _OLD_S
+        if too_old or command.sent_hold_after(observer.motion):
+            with contextlib.suppress(DeviceTimeoutError):
+                await observer.read_telemetry(device, None)
+        observer.note_sent(await command.send_hold(device, observer.motion, self._clock.now_s()))
+
+    async def _on_refusal(self, device: Ph54Device, error: DeviceRefusedError) -> None:
         """A goal was refused: the watchdog has tripped, or the servo is not as we left it. Never go on blindly."""
         log.warning("%s: %s", DEVICE, error, extra=FIELDS)
         was_active = self.lifecycle is Lifecycle.ACTIVE
-        if was_active:
-            self.lifecycle = Lifecycle.STANDBY
-        if error.error == StatusError.DATA_RANGE:
+        self.note(Event.DISARMED)
+        if isinstance(error, ServoRefusedError) and error.error == StatusError.DATA_RANGE:
             await self._observer.read_goals(device, attempts_n=ATTEMPTS_N)
         elif was_active:
             detail = f"a goal was refused: {error.cause}"

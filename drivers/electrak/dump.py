@@ -17,7 +17,6 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final, Literal, TextIO, TypedDict
 
-import can
 from cantools.database.can import Message as DbcMessage
 from cantools.database.namedsignalvalue import NamedSignalValue
 
@@ -29,6 +28,7 @@ from graderd.drivers.j1939.can_port import READY_S, PortLostError, open_port
 from graderd.drivers.j1939.ids import Pgn, destination_of, pgn_name, pgn_of, source_of
 from graderd.drivers.j1939.name import Name
 from graderd.drivers.j1939.node import Ack
+from graderd.drivers.j1939.python_can import can
 from graderd.drivers.j1939.transport import Control, Listener, Message
 from graderd.hal.errors import DeviceError, DeviceLostError, ProtocolError
 from graderd.hal.settings import CanSettings

@@ -13,12 +13,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-import can
-from can.io.generic import BinaryIOMessageReader
-from can.io.player import MESSAGE_READERS
-
 from graderd.drivers.j1939.bus_health import ERROR_FRAMES, BusEvent
 from graderd.drivers.j1939.ids import Frame
+from graderd.drivers.j1939.python_can import MESSAGE_READERS, BinaryIOMessageReader, can, load_mf4
 from graderd.hal.errors import ProtocolError
 
 _ERROR_FLAG: Final = 0x2000_0000
@@ -112,6 +109,8 @@ def read_file(path: Path) -> Iterator[can.Message]:
     """
     packed = path.suffix.lower() == ".gz"
     suffix = path.with_suffix("").suffix.lower() if packed else path.suffix.lower()
+    if suffix == ".mf4":
+        load_mf4()
     reader = MESSAGE_READERS.get(suffix)
     is_candump = reader is None or suffix in _CANDUMP_SUFFIXES
     is_binary = reader is not None and issubclass(reader, BinaryIOMessageReader)

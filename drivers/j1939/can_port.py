@@ -17,11 +17,9 @@ import struct
 from pathlib import Path
 from typing import Final, Literal
 
-import can
-from can.interfaces.socketcan import SocketcanBus
-
 from graderd.drivers.j1939.bus_health import ERROR_FRAMES, BusEvent, event_of
 from graderd.drivers.j1939.ids import Frame
+from graderd.drivers.j1939.python_can import SocketcanBus, can
 from graderd.drivers.j1939.slcan_bus import QuietSlcanBus
 from graderd.hal.errors import DeviceMissingError
 from graderd.hal.settings import CanSettings

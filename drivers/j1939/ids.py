@@ -33,6 +33,7 @@ class Pgn(IntEnum):
     COMMANDED_ADDRESS = 0xFED8
     SOFTWARE_ID = 0xFEDA
     COMPONENT_ID = 0xFEEB
+    CRUISE_CONTROL_VEHICLE_SPEED = 0xFEF1  # J1939-71 "cruise control/vehicle speed 1", CCVS1
 
 
 class Frame(NamedTuple):

@@ -10,10 +10,8 @@ import select
 import time
 from typing import Final
 
-import can
-from can.interfaces.slcan import slcanBus
-
 from graderd.drivers.j1939.bus_health import REFUSED_N, BusEvent
+from graderd.drivers.j1939.python_can import can, slcanBus
 
 _OPEN_AGAIN_S: Final = 0.5
 """An adapter that has not answered so long after it was told to open its channel is told again."""

@@ -16,6 +16,7 @@ from graderd.api.port import DaemonPort
 from graderd.api.problem import Problem, ProblemError, problem_of_validation
 from graderd.api.settings import ApiLimits
 from graderd.api.sockets import socket_routes
+from graderd.api.stop import StopLane
 
 DESCRIPTION = """\
 The daemon's one interface, for the command line, the operator's page and any other client.
@@ -27,13 +28,14 @@ every field's name, or stands in the field `unit` beside it.
 Anything that is refused is answered with the same three fields: `error` (why), `where` (which command, field or
 header) and `remedy` (what to do).
 
-Three paths are WebSockets: `/v1/stream`, `/v1/jog` and `/v1/can`. Messages are JSON texts, those of `/v1/can` candump
-lines.
+Three paths are WebSockets: `/v1/stream`, `/v1/jog` and `/v1/bus/{name}`. Messages are JSON texts, those of
+`/v1/bus/{name}` lines of a wire's traffic.
 """
 
 
 def make_app(port: DaemonPort, limits: ApiLimits | None = None) -> FastAPI:
-    """The application. ``app.state.closing`` is its :class:`Closing`; whoever serves it tells it when to end."""
+    """The application. ``app.state.closing`` is its :class:`Closing`; whoever serves it tells it when to end.
+    ``app.state.stops`` carries out stops, ``app.state.stop_socket`` those of the socket that serves nothing else."""
     limits = limits or ApiLimits()
     app = FastAPI(
         title="graderd",
@@ -47,9 +49,11 @@ def make_app(port: DaemonPort, limits: ApiLimits | None = None) -> FastAPI:
         servers=[{"url": "http://localhost", "description": "over the unix socket"}],
     )
     app.state.closing = Closing()
+    app.state.stops = StopLane(port, limits)
+    app.state.stop_socket = StopLane(port, limits)
     texts = StatusTexts()
-    app.include_router(http_routes(port, limits, texts))
-    app.include_router(socket_routes(port, limits, texts, app.state.closing))
+    app.include_router(http_routes(port, limits, texts, app.state.stops))
+    app.include_router(socket_routes(port, limits, texts, app.state.closing, app.state.stops))
     app.add_middleware(Limiter, limits=limits, closing=app.state.closing)
     for kind, handler in _handlers().items():
         app.add_exception_handler(kind, handler)

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Annotated, Any
+from collections import OrderedDict
+from collections.abc import Coroutine
+from typing import Annotated, Any, TypeVar
 
-from fastapi import APIRouter, Body, Path, Response
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from fastapi import APIRouter, Body, Path, Request, Response
+from pydantic import Field, StrictBool, create_model
+from starlette.requests import HTTPConnection
 
 from graderd.api.port import DaemonPort, ServiceError
 from graderd.api.problem import Problem, ProblemError
 from graderd.api.settings import ApiLimits
+from graderd.api.stop import StopLane
 from graderd.core.commands import AnyCommand, Command, Reply, Stop
 from graderd.core.status import Status
+from graderd.hal.service import DeviceService
+from graderd.hal.text import printable
 
 COMMAND_EXAMPLES: dict[str, Any] = {
     "arm": {"summary": "Power the devices and hold", "value": {"command": "arm", "client": "cab"}},
@@ -35,13 +41,33 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
 }
 
 
-class StopRequest(BaseModel):
-    """Body of a stop; it may be left out."""
-
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"reason": "person near the blade"}]})
-
-    client: str = Field("", max_length=80, description="who asks")
-    reason: str = Field("stop request", max_length=200, description="kept as the reason of the stop")
+NEEDS_CONSENT = """Wants `consent: true`, a disarmed machine, and no other such service under way."""
+ENDS_WITH_CLIENT = """ It ends, and the blade holds, when the connection that asked for it ends."""
+T = TypeVar("T")
+NAMES_N = 1000
+"""More than connections can be open."""
+STOP_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": False,
+        "description": "may be left out; never a reason to refuse the stop",
+        "content": {
+            "application/json": {
+                "schema": {
+                    "type": "object",
+                    "properties": {
+                        "client": {"type": "string", "maxLength": 80, "description": "who asks"},
+                        "reason": {
+                            "type": "string",
+                            "maxLength": 200,
+                            "description": "kept as the reason of the stop; more is cut off",
+                        },
+                    },
+                },
+                "example": {"reason": "person near the blade"},
+            }
+        },
+    }
+}
 
 
 class StatusTexts:
@@ -57,28 +83,34 @@ class StatusTexts:
         return self._text
 
 
-def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts) -> APIRouter:
-    """The routes over ``port``."""
+def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: StopLane) -> APIRouter:
+    """The routes over ``port``; ``stops`` carries out what asks for a stop."""
     router = APIRouter(prefix="/v1")
+    names = ConnectionNames()
 
     @router.get("/status", tags=["status"], summary="Everything at the last control tick", response_model=Status)
     async def status() -> Response:
         return Response(texts.text(port.status()), media_type="application/json")
 
     @router.post("/commands", tags=["commands"], summary="Send one command", responses=PROBLEMS)
-    async def command(command: Annotated[AnyCommand, Body(openapi_examples=COMMAND_EXAMPLES)]) -> Reply:
+    async def command(
+        command: Annotated[AnyCommand, Body(openapi_examples=COMMAND_EXAMPLES)], request: Request
+    ) -> Reply:
         """The reply comes after the control tick that took the command.
 
-        A jog or preset moves only while its lease is renewed (`renew`, at least every 0.3 s, 0.1 s advised); the
-        WebSocket `/v1/jog` does that on one connection and gives the lease back when the connection ends.
+        A jog or preset moves only while its lease is renewed (`renew`, at least every 0.3 s, 0.1 s advised) on the
+        connection that asked for it: the daemon names connections, and `client` is only what people read. The
+        WebSocket `/v1/jog` does that too, and gives the lease back at once when the connection ends.
         """
-        return accepted(await obey(port, command, limits))
+        asked = command.model_copy(update={"client": names.of(command.client, request)})
+        return accepted(await obey(port, asked, limits))
 
-    @router.post("/stop", tags=["commands"], summary="End motion at once", responses={504: PROBLEMS[504]})
-    async def stop(request: StopRequest | None = None) -> Reply:
-        """Wins over everything, latches, may be repeated; served ahead of every other request."""
-        request = request or StopRequest()
-        return accepted(await obey(port, Stop(client=request.client, reason=request.reason), limits))
+    @router.post("/stop", tags=["commands"], summary="End motion at once", openapi_extra=STOP_BODY)
+    async def stop(request: Request) -> Reply:
+        """Wins over everything, latches, may be repeated; served ahead of every other request and never refused. The
+        request line is the stop: motion ends whatever the body is, which only says why; what was not understood of it
+        is told in `message`. Every other method does the same."""
+        return await stops.serve(request.receive)
 
     @router.get("/config", tags=["status"], summary="The configuration in force")
     async def config() -> dict[str, Any]:
@@ -98,28 +130,88 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts) -> APIR
             raise ProblemError(404, error.message, "preview", error.remedy) from error
         return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
 
-    @router.post(
-        "/services/{name}",
-        tags=["services"],
-        summary="A device service outside the control loop",
-        responses={409: PROBLEMS[409], 422: PROBLEMS[422], 503: PROBLEMS[503]},
-    )
-    async def service(
-        name: Annotated[str, Path(max_length=80, pattern=r"^[a-z_.]+$", examples=["rotation.verify_profile"])],
-        arguments: Annotated[
-            dict[str, JsonValue] | None,
-            Body(openapi_examples={"reboot": {"summary": "Reboot the servo", "value": {"consent": True}}}),
-        ] = None,
-    ) -> dict[str, Any]:
-        """`rotation.verify_profile`, `rotation.reboot`, `rotation.step_response`, `camera.calibrate` (its pictures:
-        `camera.calibration_file`, once each). Those that move a device or take its power want `consent: true`: somebody
-        has looked and nobody is near the blade."""
-        try:
-            return await port.service(name, dict(arguments or {}))
-        except ServiceError as error:
-            raise ProblemError(409, error.message, name, error.remedy) from error
+    for name, offered in port.services().items():
+        _add_service(router, port, name, offered)
+
+    @router.post("/services/{name}", include_in_schema=False)
+    async def unknown_service(name: Annotated[str, Path(max_length=80, pattern=r"^[a-z_.]+$")]) -> dict[str, Any]:
+        return await _served(port, name, {})
 
     return router
+
+
+def _add_service(router: APIRouter, port: DaemonPort, name: str, offered: DeviceService) -> None:
+    """The route of one service, with its arguments as it describes them."""
+    consent: Any = (StrictBool, Field(False, description="somebody has looked and nobody is near the blade"))
+    fields = {} if offered.only_reads else {"consent": consent}
+    model = create_model(
+        f"{name.title().replace('.', '').replace('_', '')}Request", __base__=offered.arguments, **fields
+    )
+
+    async def service(request: Request, arguments: Any = None) -> dict[str, Any]:
+        given = {} if arguments is None else arguments.model_dump(exclude_unset=True)
+        return await _while_connected(request, _served(port, name, given))
+
+    service.__annotations__ = {
+        "request": Request,
+        "arguments": Annotated[model | None, Body()],
+        "return": dict[str, Any],
+    }
+    service.__doc__ = "" if offered.only_reads else NEEDS_CONSENT + ENDS_WITH_CLIENT * offered.moves
+    responses: dict[int | str, dict[str, Any]] = {number: PROBLEMS[number] for number in (409, 422, 503)}
+    router.add_api_route(
+        f"/services/{name}",
+        service,
+        methods=["POST"],
+        tags=["services"],
+        summary=offered.summary,
+        responses=responses,
+        operation_id=f"service_{name.replace('.', '_')}",
+    )
+
+
+async def _served(port: DaemonPort, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    try:
+        return await port.service(name, arguments)
+    except ServiceError as error:
+        raise ProblemError(409, error.message, name, error.remedy) from error
+
+
+async def _while_connected(request: Request, work: Coroutine[Any, Any, T]) -> T:
+    """The result of ``work``, which is cancelled, and waited for, when the client goes."""
+    working = asyncio.create_task(work, name=f"api {request.url.path}")
+    connected = asyncio.create_task(_disconnected(request), name=f"api {request.url.path} client")
+    try:
+        await asyncio.wait((working, connected), return_when=asyncio.FIRST_COMPLETED)
+        if not working.done():
+            raise ProblemError(409, "the client went away", request.url.path)
+        return working.result()
+    finally:
+        for task in (working, connected):
+            task.cancel()
+        await asyncio.gather(working, connected, return_exceptions=True)
+
+
+async def _disconnected(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+class ConnectionNames:
+    """The names that leases go by: what a client called itself first on its connection, and the number of that
+    connection, which is the daemon's to give and nobody else's."""
+
+    def __init__(self) -> None:
+        self._names: OrderedDict[int, str] = OrderedDict()
+
+    def of(self, given: str, connection: HTTPConnection) -> str:
+        """The name of whoever speaks on this connection."""
+        number = connection.client.port if connection.client is not None else 0
+        if number not in self._names:
+            self._names[number] = f"{printable(given) or 'client'}#{number}"
+            if len(self._names) > NAMES_N:
+                self._names.popitem(last=False)
+        return self._names[number]
 
 
 async def obey(port: DaemonPort, command: Command, limits: ApiLimits) -> Reply:
@@ -128,6 +220,8 @@ async def obey(port: DaemonPort, command: Command, limits: ApiLimits) -> Reply:
     Raises:
         ProblemError: 504, the control tick did not answer.
     """
+    if isinstance(command, Stop):
+        return port.stop(command)
     try:
         async with asyncio.timeout(limits.command_timeout_s):
             return await port.command(command)

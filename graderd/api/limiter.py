@@ -8,16 +8,18 @@ enough that a client in a loop cannot spin. Stop requests take no part in that: 
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
+from graderd.api.pace import Pace
 from graderd.api.problem import Problem, answer
 from graderd.api.settings import ApiLimits
+from graderd.api.stop import STOP_PATH, is_stop_command, is_stop_path
 
 
 class Closing:
@@ -54,36 +56,11 @@ class Closing:
             self._requests.discard(task)
 
 
-STOP_PATH = "/v1/stop"
 COMMANDS_PATH = "/v1/commands"
 SERVICES_PREFIX = "/v1/services/"
+LOOK_AT_MOST = 4
+"""A command that is so many times larger than allowed is looked at for a stop, and no further."""
 METHODS_WITH_BODY = ("POST", "PUT", "PATCH", "DELETE")
-
-
-class Pace:
-    """A leaky bucket: at most ``burst_n`` at once and ``rate_hz`` in the long run."""
-
-    def __init__(self, rate_hz: float, burst_n: int) -> None:
-        self._interval_s = 1.0 / rate_hz
-        self._depth_s = burst_n / rate_hz
-        self._next_s = float("-inf")
-
-    def delay_s(self, now_s: float) -> float:
-        """Book one turn and say how long to wait for it."""
-        self._next_s = max(self._next_s, now_s - self._depth_s) + self._interval_s
-        return max(0.0, self._next_s - now_s)
-
-    def take(self, now_s: float) -> bool:
-        """Book a turn if it may be had at once, and say whether."""
-        if max(self._next_s, now_s - self._depth_s) + self._interval_s > now_s:
-            return False
-        self.delay_s(now_s)
-        return True
-
-
-def stop_pace(limits: ApiLimits) -> Pace:
-    """How many stops a second are carried out in full."""
-    return Pace(limits.stop_rate_hz, max(1, round(limits.stop_rate_hz / 10)))
 
 
 class Limiter:
@@ -94,7 +71,6 @@ class Limiter:
         self._limits = limits
         self._closing = closing
         self._pace = Pace(limits.rate_hz, limits.burst_n)
-        self._stop_pace = stop_pace(limits)
         self._slots = asyncio.Semaphore(limits.active_n)
         self._services = asyncio.Semaphore(limits.services_n)
         self._waiting_n = 0
@@ -147,23 +123,20 @@ class Limiter:
             await answer(503, problem, scope, receive, send, {"Connection": "close"})
 
     async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
-        path = scope["path"]
+        if is_stop_path(scope["path"]):
+            # With whatever method, also one that should only ask: nobody who writes this means to let it go on.
+            await self._app({**scope, "method": "POST", "path": STOP_PATH}, receive, send)
+            return
         if scope["method"] in METHODS_WITH_BODY:
             body = await self._read_body(scope, receive, send)
             if body is None:
                 return
             receive = _replay(body, receive)
-            if path == STOP_PATH or (path == COMMANDS_PATH and _is_stop(body)):
-                await self._serve_stop(scope, receive, send)
+            if body.is_stop:
+                # Whatever else is in it, it goes the way of a stop.
+                await self._app({**scope, "method": "POST", "path": STOP_PATH}, receive, send)
                 return
         await self._serve(scope, receive, send)
-
-    async def _serve_stop(self, scope: Scope, receive: Receive, send: Send) -> None:
-        delay_s = self._stop_pace.delay_s(asyncio.get_running_loop().time())
-        if delay_s > 0:
-            # Only after a burst of other stops, which did the same: waiting delays an answer, never the first stop.
-            await asyncio.sleep(delay_s)
-        await self._app(scope, receive, send)
 
     async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         service = scope["path"].startswith(SERVICES_PREFIX)
@@ -195,24 +168,28 @@ class Limiter:
         headers = {"Retry-After": "1", "Connection": "close"}
         await answer(503, problem, scope, receive, send, headers)
 
-    async def _read_body(self, scope: Scope, receive: Receive, send: Send) -> bytes | None:
-        """The request's body; None where it was too large, too slow or cut off, and that was answered."""
+    async def _read_body(self, scope: Scope, receive: Receive, send: Send) -> _Body | None:
+        """The request's body; None where it was too large, too slow or cut off, and that was answered. A command is
+        looked at while it comes: a stop in it does not wait for its end, nor for its size to be allowed."""
         limit_n = self._limits.body_max_bytes_n
-        too_large = Problem(
-            error=f"the request's body is larger than {limit_n} bytes", where="body", remedy="send less"
-        )
-        body = bytearray()
+        commands = scope["path"].rstrip("/") == COMMANDS_PATH
+        body, size_n = bytearray(), 0
         try:
             async with asyncio.timeout(self._limits.body_timeout_s):
                 while True:
                     message = await receive()
                     if message["type"] == "http.disconnect":
                         return None
-                    body += message.get("body", b"")
-                    if len(body) > limit_n:
+                    piece = message.get("body", b"")
+                    size_n += len(piece)
+                    body += piece
+                    more = message.get("more_body", False)
+                    if commands and is_stop_command(body, complete=not more):
+                        return _Body(bytes(body), more, True)
+                    if size_n > limit_n and (not commands or not more or size_n > LOOK_AT_MOST * limit_n):
                         break
-                    if not message.get("more_body", False):
-                        return bytes(body)
+                    if not more:
+                        return _Body(bytes(body), False, False)
         except TimeoutError:
             slow = Problem(
                 error=f"the request's body did not arrive within {self._limits.body_timeout_s:g} s",
@@ -221,22 +198,23 @@ class Limiter:
             )
             await answer(408, slow, scope, receive, send, {"Connection": "close"})
             return None
+        too_large = Problem(
+            error=f"the request's body is larger than {limit_n} bytes", where="body", remedy="send less"
+        )
         await answer(413, too_large, scope, receive, send, {"Connection": "close"})
         return None
 
 
-def _is_stop(body: bytes) -> bool:
-    """Whether the body of a command asks for a stop. The cheap look comes first; most bodies are not stops."""
-    if b"stop" not in body:
-        return False
-    try:
-        message = json.loads(body)
-    except (ValueError, RecursionError):
-        return False
-    return isinstance(message, dict) and message.get("command") == "stop"
+@dataclass(frozen=True, slots=True)
+class _Body:
+    """What was read of a request's body, and whether more of it comes."""
+
+    data: bytes
+    more: bool
+    is_stop: bool
 
 
-def _replay(body: bytes, receive: Receive) -> Callable[[], Awaitable[Message]]:
+def _replay(body: _Body, receive: Receive) -> Callable[[], Awaitable[Message]]:
     """A ``receive`` that gives the body already read, then whatever comes after it."""
     given = False
 
@@ -245,6 +223,6 @@ def _replay(body: bytes, receive: Receive) -> Callable[[], Awaitable[Message]]:
         if given:
             return await receive()
         given = True
-        return {"type": "http.request", "body": body, "more_body": False}
+        return {"type": "http.request", "body": body.data, "more_body": body.more}
 
     return replayed

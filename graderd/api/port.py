@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Mapping
 from typing import Any, Protocol
 
-from graderd.core.commands import Command, Reply
+from graderd.core.commands import Command, Reply, Stop
 from graderd.core.status import Status
+from graderd.hal.service import DeviceService
 
 
 class ServiceError(Exception):
@@ -30,7 +31,11 @@ class DaemonPort(Protocol):
         ...
 
     async def command(self, command: Command) -> Reply:
-        """Hand a command to the next tick and wait for its reply. Stop is taken ahead of all others."""
+        """Hand a command to the next tick and wait for its reply."""
+        ...
+
+    def stop(self, command: Stop) -> Reply:
+        """Stop: every wire is told before this returns, and nothing is waited for."""
         ...
 
     def config(self) -> dict[str, Any]:
@@ -45,14 +50,20 @@ class DaemonPort(Protocol):
         """
         ...
 
-    def bus_text(self) -> AsyncGenerator[str, None]:
-        """The CAN bus from now on as candump text, some lines at a time; ends when it is closed."""
+    def bus_text(self, name: str) -> AsyncGenerator[str, None]:
+        """What is on a wire (``can``, ``servo``) from now on, some lines at a time; ends when it is closed.
+
+        Raises:
+            ServiceError: there is no such wire.
+        """
+        ...
+
+    def services(self) -> Mapping[str, DeviceService]:
+        """The device services outside the control loop, by name; they stay the same."""
         ...
 
     async def service(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
-        """A device service outside the control loop: ``rotation.verify_profile``, ``rotation.reboot``,
-        ``rotation.step_response``, ``camera.calibrate``, ``camera.calibration_file``.
-        Those that move or unpower want ``consent: true``.
+        """Run one of them. Those that move or unpower want ``consent`` to be True, and end when this is cancelled.
 
         Raises:
             ServiceError: unknown, refused in this mode, or failed.

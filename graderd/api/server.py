@@ -6,30 +6,36 @@ import asyncio
 import contextlib
 import fcntl
 import grp
+import itertools
 import logging
 import os
 import socket
 import stat
 import sys
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import h11
 import uvicorn
 from fastapi import FastAPI
-from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from graderd.api.limiter import Pace
-from graderd.api.problem import Problem, ProblemError
+from graderd.api.http_head import JudgedConnection, problem_of_head
+from graderd.api.pace import Pace
 from graderd.api.settings import ApiLimits, TcpSettings
+from graderd.api.stop import StopLane, is_stop_line
+from graderd.api.stop_socket import serving_stops, stop_socket_beside
 from graderd.api.tcp_guard import TcpGuard, load_or_make_token
 from graderd.hal.errors import DeviceError
 
 MAX_PATH_BYTES = 107
+LOOK_AFTER_FILE_S = 1.0
+
+log = logging.getLogger(__name__)
 
 
 class SocketInUseError(DeviceError):
@@ -54,7 +60,8 @@ def unix_socket(path: Path, mode: int, group: str | None) -> Iterator[socket.soc
         raise SocketError(where, f"the path is longer than {MAX_PATH_BYTES} bytes", "choose a shorter one")
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(_lock(path))
+            if not _is_locked_by_us(path):
+                stack.enter_context(_lock(path))
             _remove_stale(path)
             listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
             # Linux takes the rights of the new file from the socket: nobody else gets in before they are set for good.
@@ -70,6 +77,16 @@ def unix_socket(path: Path, mode: int, group: str | None) -> Iterator[socket.soc
             ) from error
         listener.setblocking(False)
         yield listener
+
+
+def _is_locked_by_us(path: Path) -> bool:
+    """Whether this process holds the lock already: the socket file alone was taken away, and is made again."""
+    held = _locks.get(path)
+    lock_path = path.with_name(path.name + ".lock")
+    return held is not None and lock_path.exists() and os.path.samestat(os.fstat(held), lock_path.stat())
+
+
+_locks: dict[Path, int] = {}
 
 
 @contextlib.contextmanager
@@ -95,8 +112,11 @@ def _lock(path: Path) -> Iterator[None]:
     try:
         os.truncate(descriptor, 0)
         os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        _locks[path] = descriptor
         yield
     finally:
+        if _locks.get(path) == descriptor:
+            del _locks[path]
         lock_path.unlink(missing_ok=True)
         os.close(descriptor)
 
@@ -131,15 +151,15 @@ def _group_id(group: str, where: str) -> int:
 
 
 @contextlib.contextmanager
-def tcp_socket(tcp: TcpSettings) -> Iterator[socket.socket]:
-    where = f"api tcp {tcp.host}:{tcp.port_n}"
-    family = socket.AF_INET6 if ":" in tcp.host else socket.AF_INET
+def tcp_socket(host: str, port_n: int) -> Iterator[socket.socket]:
+    where = f"api tcp {host}:{port_n}"
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listener.bind((tcp.host, tcp.port_n))
+            listener.bind((host, port_n))
         except OSError as error:
-            raise SocketError(where, str(error.strerror or error), "choose another host or port_n") from error
+            raise SocketError(where, str(error.strerror or error), "choose another host or port") from error
         listener.setblocking(False)
         yield listener
 
@@ -148,11 +168,10 @@ ACCEPT_BURST_N = 20
 ACCEPT_RETRY_S = 0.1
 LISTEN_QUEUE_N = 128
 STREAM_BUFFER_BYTES = 16_384
-HEAD_MAX_BYTES = 8192
-"""Request line and headers."""
 READ_BYTES = 1024
 """Some hundred of the smallest frames: a few milliseconds."""
 LINGER_S = 0.5
+LOST_AFTER_S = 3
 
 
 async def serve(
@@ -175,15 +194,32 @@ async def serve(
         DeviceError: the token file is not usable.
     """
     limits = limits or ApiLimits()
-    with contextlib.ExitStack() as stack:
+    stops: StopLane = app.state.stop_socket
+    async with contextlib.AsyncExitStack() as stack:
         listener = stack.enter_context(unix_socket(socket_path, socket_mode, socket_group))
         servers = [_Server(_config(app, limits), listener, limits)]
+        stop_listener = stack.enter_context(unix_socket(stop_socket_beside(socket_path), socket_mode, socket_group))
+        await stack.enter_async_context(serving_stops(stop_listener, stops))
         if tcp is not None:
-            listener = stack.enter_context(tcp_socket(tcp))
-            port_n = listener.getsockname()[1]
-            guard = TcpGuard(load_or_make_token(tcp.token_file), port_n, tcp.allowed_hosts)
+            listener = stack.enter_context(tcp_socket(tcp.host, tcp.port_n))
+            stop_listener = stack.enter_context(tcp_socket(tcp.host, tcp.port_of_stop_n()))
+            token = load_or_make_token(tcp.token_file)
+            ports = (listener.getsockname()[1], stop_listener.getsockname()[1])
+            guard, stop_guard = (TcpGuard(token, port_n, tcp.allowed_hosts) for port_n in ports)
+            await stack.enter_async_context(serving_stops(stop_listener, stops, stop_guard))
             servers.append(_Server(_config(app, limits, guard), listener, limits))
         tasks = [asyncio.create_task(server.run_until_told(), name=f"api server {server.name}") for server in servers]
+
+        async def serve_again(listener: socket.socket) -> None:
+            servers[0].accept_also(listener)
+
+        async def serve_stops_again(listener: socket.socket) -> None:
+            await stack.enter_async_context(serving_stops(listener, stops))
+
+        for path, serve_on in ((socket_path, serve_again), (stop_socket_beside(socket_path), serve_stops_again)):
+            make = partial(unix_socket, path, socket_mode, socket_group)
+            keeping = _keep_socket_file(path, make, serve_on, stack)
+            tasks.append(asyncio.create_task(keeping, name=f"api socket file {path.name}"))
         try:
             for server in servers:
                 await server.answering.wait()
@@ -196,13 +232,47 @@ async def serve(
             app.state.closing.begin()
             for server in servers:
                 server.should_exit = True
+            for task in tasks[len(servers) :]:
+                task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _config(app: ASGIApp, limits: ApiLimits, guard: TcpGuard | None = None) -> uvicorn.Config:
+async def _keep_socket_file(
+    path: Path,
+    make: Callable[[], contextlib.AbstractContextManager[socket.socket]],
+    serve_on: Callable[[socket.socket], Awaitable[None]],
+    stack: contextlib.AsyncExitStack,
+) -> None:
+    """Make the socket file again when somebody has taken it away: clients, and a stop, would find nobody. Who is
+    connected stays so."""
+    ours = _identity(path)
+    while True:
+        await asyncio.sleep(LOOK_AFTER_FILE_S)
+        if ours is not None and _identity(path) == ours:
+            continue
+        try:
+            listener = stack.enter_context(make())
+            ours = _identity(path)
+        except (OSError, SocketError) as error:
+            log.warning("%s was taken away and cannot be made again: %s", path, error)
+            continue
+        await serve_on(listener)
+        log.warning("%s was taken away: made again", path)
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Which file is there; None: there is none."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+def _config(app: FastAPI, limits: ApiLimits, guard: TcpGuard | None = None) -> uvicorn.Config:
     return uvicorn.Config(
         app,
-        http=_bounded_http(limits, guard),
+        http=_bounded_http(limits, guard, app.state.stops),
         ws=_StreamProtocol,
         ws_max_size=limits.body_max_bytes_n,
         ws_per_message_deflate=False,
@@ -226,6 +296,7 @@ class _Server(uvicorn.Server):
         super().__init__(config)
         self._listener = listener
         self._pace = Pace(limits.accept_rate_hz, ACCEPT_BURST_N)
+        self._also_accepting: list[asyncio.Task[None]] = []
         self.answering = asyncio.Event()
         self.name = str(listener.getsockname())
 
@@ -236,14 +307,15 @@ class _Server(uvicorn.Server):
     async def run_until_told(self) -> None:
         """Serve until ``should_exit``."""
         serving = asyncio.create_task(self.serve(), name=f"api serve {self.name}")
-        accepting = asyncio.create_task(self._accept(), name=f"api accept {self.name}")
+        accepting = asyncio.create_task(self._accept(self._listener), name=f"api accept {self.name}")
         try:
             # Neither ends by itself: the first that does has failed, or was told to.
             await asyncio.wait((accepting, serving), return_when=asyncio.FIRST_COMPLETED)
         finally:
             self.should_exit = True
-            accepting.cancel()
-            results = await asyncio.gather(accepting, serving, return_exceptions=True)
+            for task in (accepting, *self._also_accepting):
+                task.cancel()
+            results = await asyncio.gather(accepting, *self._also_accepting, serving, return_exceptions=True)
         for result in results:
             if isinstance(result, Exception):
                 raise result
@@ -257,24 +329,41 @@ class _Server(uvicorn.Server):
         self._listener.listen(LISTEN_QUEUE_N)
         self.answering.set()
 
-    async def _accept(self) -> None:
+    def accept_also(self, listener: socket.socket) -> None:
+        """Take connections from a further socket."""
+        listener.listen(LISTEN_QUEUE_N)
+        self._also_accepting.append(asyncio.create_task(self._accept(listener), name=f"api accept again {self.name}"))
+
+    async def _accept(self, listener: socket.socket) -> None:
         loop = asyncio.get_running_loop()
         await self.answering.wait()
         while True:
             try:
-                connection, _ = await loop.sock_accept(self._listener)
+                connection, _ = await loop.sock_accept(listener)
             except ConnectionError:
                 continue
             except OSError as error:
-                logging.getLogger(__name__).warning("%s: no connection taken: %s", self.name, error)
+                log.warning("%s: no connection taken: %s", self.name, error)
                 await asyncio.sleep(ACCEPT_RETRY_S)
                 continue
+            if connection.family != socket.AF_UNIX:
+                _notice_loss(connection)
             await loop.connect_accepted_socket(self._protocol, connection)
             await asyncio.sleep(self._pace.delay_s(loop.time()))
 
     def _protocol(self) -> asyncio.Protocol:
         protocol = cast("type[H11Protocol]", self.config.http_protocol_class)
         return protocol(config=self.config, server_state=self.server_state, app_state=self.lifespan.state)
+
+
+def _notice_loss(connection: socket.socket) -> None:
+    """Have the kernel end a connection whose other end has been gone for :data:`LOST_AFTER_S` without a word (its cable
+    pulled, its computer off): what it moves ends with it."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, LOST_AFTER_S - 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LOST_AFTER_S * 1000)
 
 
 class _SmallReads(asyncio.BufferedProtocol):
@@ -303,53 +392,15 @@ class _SmallReads(asyncio.BufferedProtocol):
             """What the protocol does with a piece."""
 
 
-class _JudgedConnection(h11.Connection):
-    """h11's parser, which gives nobody a request whose head was not judged: by its size, and by the guard."""
-
-    def __init__(self, guard: TcpGuard | None) -> None:
-        super().__init__(h11.SERVER, HEAD_MAX_BYTES)
-        self._guard = guard
-
-    def next_event(self) -> Any:
-        """As in h11.
-
-        Raises:
-            h11.RemoteProtocolError: no valid HTTP, or a head that is too long.
-            _RefusedError: the guard does not let it in.
-        """
-        event = super().next_event()
-        if isinstance(event, h11.Request):
-            size_n = len(event.target) + sum(len(name) + len(value) + 4 for name, value in event.headers)
-            if size_n > HEAD_MAX_BYTES:
-                raise h11.RemoteProtocolError("too long a head", error_status_hint=431)
-            refusal = self._guard.refusal(event.target, event.headers) if self._guard is not None else None
-            if refusal is not None:
-                raise _RefusedError(refusal)
-        return event
+_numbers = itertools.count(1)
 
 
-class _RefusedError(h11.RemoteProtocolError):
-    """A request that the guard does not let in, in the form in which uvicorn expects a parser to fail."""
-
-    def __init__(self, refusal: ProblemError) -> None:
-        super().__init__(str(refusal), refusal.status_code)
-        self.refusal = refusal
+def _numbered(client: tuple[str, int] | None) -> tuple[str, int]:
+    """Where a connection comes from, and a number that no other connection of this process has."""
+    return (client[0] if client is not None else "unix", next(_numbers))
 
 
-def _problem_of(error: BaseException | None) -> tuple[int, Problem]:
-    """What to answer where a request's head was not taken."""
-    if isinstance(error, _RefusedError):
-        return error.refusal.status_code, error.refusal.problem
-    if isinstance(error, h11.RemoteProtocolError) and error.error_status_hint == 431:
-        return 431, Problem(
-            error=f"the request's head is longer than {HEAD_MAX_BYTES} bytes",
-            where="request",
-            remedy="send fewer or shorter headers",
-        )
-    return 400, Problem(error="this is no valid HTTP request", where="request")
-
-
-def _bounded_http(limits: ApiLimits, guard: TcpGuard | None) -> type[H11Protocol]:
+def _bounded_http(limits: ApiLimits, guard: TcpGuard | None, stops: StopLane) -> type[H11Protocol]:
     """uvicorn's HTTP protocol with a bound on open connections: the oldest makes room for a new one, so that a client
     that wants to send stop gets in however many hang about."""
     open_connections: OrderedDict[H11Protocol, None] = OrderedDict()
@@ -357,11 +408,12 @@ def _bounded_http(limits: ApiLimits, guard: TcpGuard | None) -> type[H11Protocol
     class BoundedProtocol(_SmallReads, H11Protocol):
         def __init__(self, *args: Any, **kwargs: Any) -> None:
             super().__init__(*args, **kwargs)
-            self.conn = _JudgedConnection(guard)
+            self.conn = self._judged = JudgedConnection(guard)
             self._ending: asyncio.TimerHandle | None = None
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as in uvicorn
             super().connection_made(transport)
+            self.client = _numbered(self.client)
             open_connections[self] = None
             if len(open_connections) > limits.connections_max_n:
                 oldest, _ = open_connections.popitem(last=False)
@@ -380,8 +432,12 @@ def _bounded_http(limits: ApiLimits, guard: TcpGuard | None) -> type[H11Protocol
         def send_400_response(self, msg: str) -> None:
             """What was not taken is answered in the same form as everything else, as far as it can be answered."""
             del msg  # uvicorn's word for any of the reasons; the error under way knows which
-            status_code, problem = _problem_of(sys.exc_info()[1])
+            status_code, problem = problem_of_head(sys.exc_info()[1])
             body = problem.model_dump_json().encode()
+            if guard is None and is_stop_line(self._judged.line):
+                # Its line is the stop; who may open the unix socket may stop. On TCP a head without a valid token is
+                # nobody's.
+                status_code, body = 200, stops.at_once().model_dump_json().encode()
             length = str(len(body))
             headers = [("content-type", "application/json"), ("content-length", length), ("connection", "close")]
             response = h11.Response(status_code=status_code, headers=headers)
@@ -406,6 +462,7 @@ class _StreamProtocol(_SmallReads, WebSocketsSansIOProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
+        self.client = _numbered(self.client)
         self.transport.set_write_buffer_limits(high=0)
         connection = transport.get_extra_info("socket")
         if connection is not None:

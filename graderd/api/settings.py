@@ -16,12 +16,21 @@ class TcpSettings(Settings):
 
     host: str = Field("127.0.0.1", description="address to listen on")
     port_n: int = Field(8431, ge=0, le=65535, description="TCP port; 0: any free one")
+    stop_port_n: int | None = Field(
+        None, ge=0, le=65535, description="TCP port that serves stop alone; none: the one after port_n"
+    )
     token_file: Path = Field(
         Path("/var/lib/graderd/api-token"), description="holds the token clients must send; made at first start"
     )
     allowed_hosts: tuple[str, ...] = Field(
         (), description="names or addresses, beside the loopback ones, under which clients may reach this machine"
     )
+
+    def port_of_stop_n(self) -> int:
+        """Where stop alone is served; 0: any free port."""
+        if self.stop_port_n is not None:
+            return self.stop_port_n
+        return self.port_n + 1 if 0 < self.port_n < 65535 else 0
 
     @model_validator(mode="after")
     def _named(self) -> TcpSettings:

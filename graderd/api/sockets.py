@@ -1,40 +1,42 @@
-"""The WebSockets: the status stream, the CAN bus, and the jog whose lease ends with its connection."""
+"""The WebSockets: the status stream, the wires, and the jog whose lease ends with its connection."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
-from collections.abc import Coroutine
+from collections.abc import AsyncGenerator, Coroutine
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, WebSocket
 from pydantic import TypeAdapter, ValidationError
 from starlette.websockets import WebSocketDisconnect
 
-from graderd.api.http_routes import StatusTexts, obey
-from graderd.api.limiter import Closing, Pace, stop_pace
-from graderd.api.port import DaemonPort
-from graderd.api.problem import Problem, ProblemError, problem_of_validation
+from graderd.api.http_routes import ConnectionNames, StatusTexts, obey
+from graderd.api.limiter import Closing
+from graderd.api.port import DaemonPort, ServiceError
+from graderd.api.problem import Problem, ProblemError, answer, problem_of_validation
 from graderd.api.settings import ApiLimits
-from graderd.core.commands import AnyCommand, Command, Jog, Preset, Release, Reply, Stop
-from graderd.core.machine import Mode
+from graderd.api.stop import StopLane, is_stop_command
+from graderd.core.commands import AnyCommand, Command, Jog, Preset, Release, Reply
 from graderd.core.status import Status
 from graderd.hal.text import printable
 
 COMMAND: TypeAdapter[Command] = TypeAdapter(AnyCommand)
 MALFORMED_PAUSE_S = 0.1
+TOO_LARGE = 1009
+"""RFC 6455: the connection was closed because of a message too large to be read."""
+TOO_LARGE_REASON = b'{"reason": "a message too large to be read"}'
 UPGRADE_ONLY: dict[int | str, dict[str, Any]] = {
     101: {"description": "the WebSocket is open"},
     426: {"model": Problem, "description": "asked for without a WebSocket upgrade"},
 }
 
 
-def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closing: Closing) -> APIRouter:
-    """The WebSockets over ``port``; ``closing`` ends them."""
+def socket_routes(
+    port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closing: Closing, stops: StopLane
+) -> APIRouter:
+    """The WebSockets over ``port``; ``closing`` ends them, ``stops`` carries out what asks for a stop."""
     router = APIRouter(prefix="/v1")
-    numbers = itertools.count(1)
-    stops = stop_pace(limits)
 
     @router.websocket("/stream")
     async def stream(socket: WebSocket, rate_hz: Annotated[float, Query(gt=0, le=1000)] = limits.stream_max_hz) -> None:
@@ -44,16 +46,22 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
     @router.websocket("/jog")
     async def jog(socket: WebSocket, client: Annotated[str, Query(max_length=60)] = "jog") -> None:
         await socket.accept()
-        session = _JogSession(port, limits, stops, f"{printable(client)}#{next(numbers)}")
+        session = _JogSession(port, limits, stops, ConnectionNames().of(client, socket))
         try:
             await _until_closed(socket, session.run(socket), closing)
         finally:
             await session.release()
 
-    @router.websocket("/can")
-    async def can(socket: WebSocket) -> None:
+    @router.websocket("/bus/{name}")
+    async def bus(socket: WebSocket, name: str) -> None:
+        try:
+            texts = port.bus_text(name)
+        except ServiceError as error:
+            problem = Problem(error=error.message, where=f"bus {printable(name)[:60]}", remedy=error.remedy)
+            await answer(404, problem, socket.scope, socket.receive, socket.send)
+            return
         await socket.accept()
-        await _until_closed(socket, _send_bus(socket, port), closing)
+        await _until_closed(socket, _send_texts(socket, texts), closing)
 
     @router.get("/stream", tags=["status"], summary="WebSocket: status as it changes", responses=UPGRADE_ONLY)
     async def stream_needs_upgrade(
@@ -72,11 +80,12 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
         connection ends for whatever reason, and lapses by itself 0.3 s after the last `renew`."""
         raise _upgrade_needed("jog")
 
-    @router.get("/can", tags=["status"], summary="WebSocket: the CAN bus as it is", responses=UPGRADE_ONLY)
-    async def can_needs_upgrade() -> str:
-        """Every frame the daemon receives or sends, as candump text, some lines a message. Times are the daemon's
-        monotonic clock. A slow client loses frames and is told how many in a line that begins with `#`."""
-        raise _upgrade_needed("can")
+    @router.get("/bus/{name}", tags=["status"], summary="WebSocket: a wire as it is", responses=UPGRADE_ONLY)
+    async def bus_needs_upgrade(name: str) -> str:
+        """Everything the daemon receives or sends on the CAN bus (`can`, candump text) or on the servo's wire (`servo`,
+        `(seconds) servo rx|tx BYTES`), some lines a message. Times are the daemon's monotonic clock. A slow client
+        loses the oldest lines and is told how many in a line that begins with `#`."""
+        raise _upgrade_needed(f"bus/{printable(name)[:60]}")
 
     return router
 
@@ -84,7 +93,7 @@ def socket_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, closi
 class _JogSession:
     """One client's connection: its commands carry a name nobody else has, so its lease is its own."""
 
-    def __init__(self, port: DaemonPort, limits: ApiLimits, stops: Pace, client: str) -> None:
+    def __init__(self, port: DaemonPort, limits: ApiLimits, stops: StopLane, client: str) -> None:
         self._port = port
         self._limits = limits
         self._stops = stops
@@ -96,8 +105,12 @@ class _JogSession:
         while True:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
+                if message.get("code") == TOO_LARGE:
+                    # Never read, it may have been a stop.
+                    await self._stops.carry_out(TOO_LARGE_REASON, self._client)
                 return
-            answer = await self._answer(message.get("text") or message.get("bytes") or b"")
+            text = message.get("text")
+            answer = await self._answer(text.encode("utf-8", "replace") if text else message.get("bytes") or b"")
             await socket.send_text(answer.model_dump_json())
 
     async def release(self) -> None:
@@ -108,7 +121,10 @@ class _JogSession:
             with contextlib.suppress(ProblemError):
                 await obey(self._port, Release(client=self._client), self._limits)
 
-    async def _answer(self, text: str | bytes) -> Reply | Problem:
+    async def _answer(self, text: bytes) -> Reply | Problem:
+        if is_stop_command(text):
+            self._moved = False
+            return await self._stops.carry_out(text, self._client)
         try:
             command = COMMAND.validate_json(text).model_copy(update={"client": self._client})
         except ValidationError as error:
@@ -117,22 +133,13 @@ class _JogSession:
             return problem_of_validation(error.errors(include_input=False, include_url=False))
         if isinstance(command, Jog | Preset):
             self._moved = True
-        if isinstance(command, Stop | Release):
+        if isinstance(command, Release):
             self._moved = False
-        if isinstance(command, Stop):
-            await self._turn_of_stop()
         try:
             reply = await obey(self._port, command, self._limits)
         except ProblemError as error:
             return error.problem
         return reply
-
-    async def _turn_of_stop(self) -> None:
-        """Wait for the turn of one of thousands of stops a second to a machine that the first has stopped. Each is
-        carried out and counted (a reset names the last), and one that finds the machine in any other mode at once."""
-        now_s = asyncio.get_running_loop().time()
-        if not self._stops.take(now_s) and self._port.status().mode is Mode.STOPPED:
-            await asyncio.sleep(self._stops.delay_s(now_s))
 
 
 async def _send_status(socket: WebSocket, port: DaemonPort, texts: StatusTexts, rate_hz: float) -> None:
@@ -148,8 +155,8 @@ async def _send_status(socket: WebSocket, port: DaemonPort, texts: StatusTexts, 
         await asyncio.sleep(max(0.0, due_s - loop.time()))
 
 
-async def _send_bus(socket: WebSocket, port: DaemonPort) -> None:
-    async with contextlib.aclosing(port.bus_text()) as texts:
+async def _send_texts(socket: WebSocket, texts: AsyncGenerator[str, None]) -> None:
+    async with contextlib.aclosing(texts):
         async for text in texts:
             await socket.send_text(text)
 

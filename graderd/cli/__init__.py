@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 from collections.abc import Sequence
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and exit with its status: 0 done, 1 refused or failed, 2 bad usage, 3 no daemon."""
-    from graderd.cli.app import run_app
+    """Run the command line and exit with its status: 0 done, 1 refused or failed, 2 bad usage, 3 no daemon. Interrupted
+    (Ctrl-C), at whatever moment, it dies by SIGINT, so that a shell ends what it would do next."""
+    try:
+        from graderd.cli.app import run_app
 
-    sys.exit(run_app(list(sys.argv[1:] if arguments is None else arguments)))
+        status = run_app(list(sys.argv[1:] if arguments is None else arguments))
+    except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGINT)
+        raise  # not reached
+    sys.exit(status)

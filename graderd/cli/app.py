@@ -25,6 +25,8 @@ from graderd.cli.console import CliError, ExitCode, print_error, print_text
 from graderd.client import ClientError, NoDaemonError
 from graderd.hal.errors import DeviceError
 
+INTERRUPTED = 130
+"""What typer makes of Ctrl-C."""
 COMMANDS = (
     processes,
     status,
@@ -45,7 +47,8 @@ def make_cli() -> typer.Typer:
     app = typer.Typer(
         name="graderd",
         help="Runs a motor grader's blade by what a camera sees.",
-        epilog="Exit status: 0 done, 1 refused or failed, 2 bad usage, 3 no daemon.",
+        epilog="Exit status: 0 done, 1 refused or failed, 2 bad usage, 3 no daemon; "
+        "after Ctrl-C it ends by SIGINT (130 in a shell), once the blade holds.",
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["--help", "-h"]},
     )
@@ -72,7 +75,11 @@ def make_cli() -> typer.Typer:
 
 
 def run_app(arguments: list[str]) -> int:
-    """Run the command line with ``arguments`` and return the exit status."""
+    """Run the command line with ``arguments`` and return the exit status.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C.
+    """
     as_json = "--json" in arguments
     try:
         result = make_cli()(arguments, prog_name="graderd", standalone_mode=False)
@@ -102,6 +109,8 @@ def run_app(arguments: list[str]) -> int:
         where = str(error.filename or "graderd")
         print_error(where, error.strerror or str(error), "Run it as a user who may use it", as_json)
         return ExitCode.FAILED
+    if result == INTERRUPTED:
+        raise KeyboardInterrupt
     return result if isinstance(result, int) else ExitCode.OK
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from graderd import places
+from graderd.cli import calibrate_lifts
 from graderd.cli.console import CliError, ExitCode, Json, client_of, example, plain_table, print_json, print_text
 from graderd.hal.errors import DeviceError
 
@@ -35,6 +36,8 @@ def register(app: typer.Typer) -> None:
     @group.callback()
     def calibrate() -> None:
         """Find out how this machine differs from the drawing, and write it down."""
+
+    calibrate_lifts.register(group)
 
     @group.command(
         epilog=example(

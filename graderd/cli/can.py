@@ -1,19 +1,18 @@
-"""``graderd can dump``: the bus, decoded."""
+"""``graderd can dump``: the bus, decoded. ``graderd can database``: its messages, for other tools."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from graderd.cli.console import TAKES_ANYTHING, client_of, example, hand_over
+from graderd.cli.wire import decode_through
 from graderd.client import Client, NoDaemonError
-from graderd.hal.text import printable
 
 _MODULE = "graderd.drivers.electrak.dump"
+_DATABASE_MODULE = "graderd.runtime.app.can_database"
 
 
 def register(app: typer.Typer) -> None:
@@ -41,9 +40,21 @@ def register(app: typer.Typer) -> None:
         sources = [argument for argument in arguments if not argument.startswith("-")]
         asks_for_help = bool({"-h", "--help"} & set(arguments))
         if not asks_for_help and is_the_daemons(client := client_of(context), sources):
-            through(client, [argument for argument in arguments if argument not in sources])
+            decode_through(client, "can", _MODULE, [argument for argument in arguments if argument not in sources])
         else:
             hand_over(_MODULE, arguments)
+
+    @can.command(
+        context_settings=TAKES_ANYTHING,
+        epilog=example(
+            "graderd can database > machine.dbc          (SavvyCAN, cantools, BUSMASTER)",
+            "graderd can database --kcd > machine.kcd    (Kayak)",
+            "graderd can database -- --help              (all its options)",
+        ),
+    )
+    def database(context: typer.Context) -> None:
+        """Print a DBC file with one message for each actuator as it is configured."""
+        hand_over(_DATABASE_MODULE, [argument for argument in context.args if argument != "--"])
 
 
 def is_the_daemons(client: Client, sources: list[str]) -> bool:
@@ -57,24 +68,3 @@ def is_the_daemons(client: Client, sources: list[str]) -> bool:
             raise
         return False
     return not sources or (bus["interface"] == "slcan" and Path(bus["channel"]).resolve() == Path(sources[0]).resolve())
-
-
-def through(client: Client, options: list[str]) -> None:
-    """Decode what the daemon hears and sends, until the daemon, the decoder's reader or the user ends it."""
-    command = [sys.executable, "-P", "-m", _MODULE, "-", *options]
-    with (
-        client.bus_text() as texts,
-        subprocess.Popen(command, stdin=subprocess.PIPE, bufsize=0) as decoder,
-    ):
-        assert decoder.stdin is not None
-        try:
-            for text in texts:
-                if decoder.poll() is not None:
-                    return
-                if text.startswith("#"):
-                    typer.echo(printable(text.partition("\n")[0]), err=True)
-                decoder.stdin.write(text.encode())
-        except (BrokenPipeError, KeyboardInterrupt):
-            return  # nobody reads on: that is how a live view ends
-        finally:
-            decoder.terminate()

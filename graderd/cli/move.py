@@ -104,6 +104,7 @@ def move(
 
     Raises:
         CliError: refused, lost or held on the way, or not arrived within ``timeout_s``.
+        KeyboardInterrupt: Ctrl-C; the lease is given back.
     """
     name = command["command"]
     interrupted = False
@@ -139,6 +140,8 @@ def move(
         print_json(result)
     else:
         print_text(f"{'arrived' if arrival.arrived else 'released'}: {arrival.where()}")
+    if interrupted:
+        raise KeyboardInterrupt  # what comes after it in a script must not go on to the next motion
 
 
 class Arrival:

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import itertools
+import logging
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from graderd.cli.console import TAKES_ANYTHING, CliError, ExitCode, Json, example, hand_over, print_json
+
+
+class LogLevel(StrEnum):
+    """Least level of the daemon's own log entries."""
+
+    DEBUG = "debug"
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
 
 
 def register(app: typer.Typer) -> None:
@@ -30,6 +41,9 @@ def _run(app: typer.Typer) -> None:
         rig_dir: Annotated[
             Path | None, typer.Option(help="Run on the simulated grader that serves this directory.")
         ] = None,
+        log_level: Annotated[
+            LogLevel, typer.Option(help="The least important entries that are logged.", case_sensitive=False)
+        ] = LogLevel.INFO,
         json: Json = False,
     ) -> None:
         """Run the daemon until SIGINT or SIGTERM.
@@ -40,7 +54,7 @@ def _run(app: typer.Typer) -> None:
             raise CliError("run", "--sim and --rig-dir exclude each other", "give one of the two", ExitCode.USAGE)
         from graderd.runtime.app import run_daemon
 
-        raise typer.Exit(run_daemon(config, sim, rig_dir, json))
+        raise typer.Exit(run_daemon(config, sim, rig_dir, json, logging.getLevelNamesMapping()[log_level.upper()]))
 
 
 def _guard(app: typer.Typer) -> None:

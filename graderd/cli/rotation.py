@@ -1,7 +1,8 @@
-"""``graderd rotation reboot | confirm-turns | step``: services of the servo that turns the blade."""
+"""``graderd rotation reboot | scan | confirm-turns | step | dump``: the servo that turns the blade."""
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,12 +15,16 @@ from graderd.cli.console import (
     client_of,
     example,
     for_people,
+    hand_over,
     print_json,
     print_table,
     print_text,
 )
+from graderd.cli.wire import decode_through
+from graderd.client import Client
 
 SERVICE_S = 120.0
+_DUMP = "graderd.drivers.dynamixel.dump"
 Yes = Annotated[
     bool, typer.Option("--yes", help="You have looked: nobody is near the blade, and it may move or lose its power.")
 ]
@@ -27,7 +32,7 @@ Yes = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    rotation = typer.Typer(help="Services of the blade's servo.", no_args_is_help=True)
+    rotation = typer.Typer(help="Services of the blade's servo, and its wire.", no_args_is_help=True)
     app.add_typer(rotation, name="rotation")
 
     @rotation.command(epilog=example("graderd rotation reboot --yes"))
@@ -42,6 +47,23 @@ def register(app: typer.Typer) -> None:
             print_json(answer)
         else:
             print_text("the servo has restarted; arm when its alerts are gone")
+
+    @rotation.command(epilog=example("graderd rotation scan --yes"))
+    def scan(context: typer.Context, yes: Yes = False, json: Json = False) -> None:
+        """Find every servo on the wire: its baud rate, id, model and firmware.
+
+        Disarmed only. Nothing but pings is sent; the servo in use is lost for ten seconds and found again.
+        """
+        need_consent("rotation scan", "the servo is not watched for ten seconds", yes)
+        answer = client_of(context).service("rotation.scan", SERVICE_S, consent=True)
+        servos = answer.get("servos", [])
+        if json:
+            print_json(answer)
+        elif servos:
+            header = tuple(servos[0])
+            print_table("Servos", header, [tuple(str(servo[name]) for name in header) for servo in servos])
+        else:
+            print_text("no servo answers at any baud rate: check the 24 V supply and the RS-485 cable")
 
     @rotation.command(epilog=example("graderd rotation confirm-turns --yes"))
     def confirm_turns(context: typer.Context, yes: Yes = False, json: Json = False) -> None:
@@ -80,6 +102,38 @@ def register(app: typer.Typer) -> None:
             if report is not None:
                 print_text(f"report: {report}")
 
+    @rotation.command(
+        epilog=example(
+            "graderd rotation dump                (the running daemon's wire)",
+            "graderd rotation dump --raw > servo.log",
+            "graderd rotation dump servo.log --json",
+        )
+    )
+    def dump(
+        context: typer.Context,
+        source: Annotated[str, typer.Argument(help="File that --raw wrote. Default: the running daemon's wire.")] = "",
+        raw: Annotated[bool, typer.Option("--raw", help="Print the bytes as they come, one piece a line.")] = False,
+        profile: Annotated[
+            str, typer.Option(help="Firmware profile whose registers are named. Default: the daemon's.")
+        ] = "",
+        json: Json = False,
+    ) -> None:
+        """Print the servo's wire decoded, both directions, live or from a file.
+
+        One line a packet: seconds of the daemon's clock, direction (tx is sent by the daemon), id, instruction, bytes
+        of the control table, registers. What is damaged is told as such. With --json one object a packet.
+        """
+        options = ["--json"] * json
+        if source:
+            hand_over(_DUMP, [source, *options, *(["--profile", profile] if profile else [])])
+            return
+        client = client_of(context)
+        if raw:
+            _print_raw(client)
+            return
+        profile = profile or client.config()["rotation"].get("profile", "")
+        decode_through(client, "servo", _DUMP, [*options, *(["--profile", profile] if profile else [])])
+
 
 def need_consent(where: str, what: str, yes: bool) -> None:
     """Ask the person at the terminal, unless ``--yes`` was given.
@@ -93,6 +147,12 @@ def need_consent(where: str, what: str, yes: bool) -> None:
         raise CliError(where, f"{what}, and nobody is there to agree", "repeat with --yes", ExitCode.USAGE)
     if not typer.confirm(f"{what.capitalize()}. Is nobody near it?"):
         raise CliError(where, "not agreed; nothing was done")
+
+
+def _print_raw(client: Client) -> None:
+    with client.bus_text("servo") as texts, contextlib.suppress(KeyboardInterrupt):
+        for text in texts:
+            print_text(text.rstrip("\n"))
 
 
 def _write(report: Path, page: Any) -> None:

@@ -93,7 +93,9 @@ def sections(state: dict[str, Any]) -> list[Section]:
         *([("last stop", state["last_stop"])] if state["last_stop"] else []),
         *([("moved by", f"{lease['client']} for {lease['remaining_s']:.1f} s more")] if lease else []),
         ("soil", _soil(state["soil"])),
+        *((name, text) for name, text in _told_apart(state["soil"])),
         ("decision", _decision(state["decision"])),
+        ("vehicle", _vehicle(state["vehicle"])),
         ("blade", _attitude(state["attitude"])),
         ("camera", _camera(state["camera"])),
         ("tick", _tick(state["tick"])),
@@ -145,10 +147,31 @@ def _soil(soil: dict[str, Any]) -> str:
     return f"{soil['zone']} ({soil['confidence']:.0%} sure; {shares}; {age}; {soil['reason']})"
 
 
+def _told_apart(soil: dict[str, Any]) -> list[Row]:
+    """What lies ahead and what the blade carries, where the method can tell."""
+    if soil["ahead"] is None or soil["carried"] is None:
+        return []
+    ahead = soil["ahead"]
+    return [
+        ("ahead", f"{ahead['zone']} ({ahead['confidence']:.0%} sure; {_litres(ahead)}; {ahead['reason']})"),
+        ("carried", _litres(soil["carried"])),
+    ]
+
+
+def _litres(thirds: dict[str, Any]) -> str:
+    return f"left {thirds['left_l']:.1f}, center {thirds['center_l']:.1f}, right {thirds['right_l']:.1f} l"
+
+
 def _decision(decision: dict[str, Any]) -> str:
     if decision["zone"] is None:
         return decision["reason"] or "none yet"
-    return f"soil {decision['zone']}: {_number(decision['angle_deg'], 'deg')}"
+    return f"{_number(decision['angle_deg'], 'deg')}: {decision['reason']}"
+
+
+def _vehicle(vehicle: dict[str, Any]) -> str:
+    if vehicle["speed_m_per_s"] is None:
+        return "does not say how it drives; a decision is kept by time"
+    return f"{_number(vehicle['speed_m_per_s'], 'm/s', 2)} ({_number(vehicle['age_s'], 's old', 2)})"
 
 
 def _attitude(attitude: dict[str, Any]) -> str:

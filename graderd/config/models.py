@@ -31,6 +31,7 @@ from graderd.hal.settings import (
     Positive,
     Settings,
     StopInputSettings,
+    VehicleSettings,
     tag_of,
 )
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
@@ -90,12 +91,6 @@ class CameraSection(CameraSettings):
     calibration: CameraCalibration = Field(default_factory=CameraCalibration)
 
 
-class PluginCameraSection(PluginCameraSettings):
-    """A camera by a driver from elsewhere, with its calibration."""
-
-    calibration: CameraCalibration = Field(default_factory=CameraCalibration)
-
-
 UNSEEN_DEG = 20.0
 """As far as between two angles of the rule."""
 LEAST_DUTY_PERCENT = 25
@@ -108,6 +103,12 @@ LIFT_SPEED = Field(
     description="motor duty in full-speed moves; at 50 % one side that sticks is 6 mm behind before its feedback says "
     "so, at 80 % 9 mm",
 )
+
+
+class PluginCameraSection(PluginCameraSettings):
+    """A camera by a driver from elsewhere, with its calibration."""
+
+    calibration: CameraCalibration = Field(default_factory=CameraCalibration)
 
 
 class LiftLeftSection(ElectrakSettings):
@@ -181,6 +182,7 @@ class Config(Settings):
     recording: RecordingSettings = Field(default_factory=RecordingSettings)
     state: StateSettings = Field(default_factory=StateSettings)
     stop_input: AnyStopInputSettings = Field(default_factory=StopInputSettings)
+    vehicle: VehicleSettings = Field(default_factory=VehicleSettings)
     presets: dict[str, Preset] = Field(default_factory=_presets)
 
     @model_validator(mode="after")
@@ -215,15 +217,17 @@ class Config(Settings):
     def _unkept(self) -> Iterator[str]:
         """What a detector or a dead man needs of other settings and does not get: one line each, with its remedy."""
         tick_s = 1.0 / self.control.tick_hz
-        rotation, pair, ticks = self.rotation, self.lift_pair, ("control.tick_hz", tick_s)
+        rotation, pair = self.rotation, self.lift_pair
+        ticks = ("control.tick_hz", tick_s)
+        unseen_s = [rotation.max_age_s, rotation.goal_timeout_s]
         needs = [
             ("machine.lease_s", self.machine.lease_s, 2, ticks),
             ("rotation.goal_timeout_s", rotation.goal_timeout_s, 2, ticks),
             *((f"{axis}.target_timeout_s", own.target_timeout_s, 2, ticks) for axis, own in self.actuators().items()),
             ("control.overrun_s", self.control.overrun_s, 1, ticks),
             ("lift_pair.silent_s", pair.silent_s, 1, ticks),
+            ("rotation.not_moving_s", rotation.not_moving_s, 3, ticks),
         ]
-        blind_s = max(rotation.max_age_s, rotation.goal_timeout_s)
         if isinstance(rotation, Ph54Settings):
             polls = ("rotation.poll_hz", 1.0 / rotation.poll_hz)
             needs += [
@@ -232,19 +236,19 @@ class Config(Settings):
                 ("rotation.watchdog_s", rotation.watchdog_s, 2, polls),
                 ("rotation.not_moving_s", rotation.not_moving_s, 3, polls),
             ]
-            blind_s = max(blind_s, rotation.watchdog_s)
+            unseen_s.append(rotation.watchdog_s)
         for name, value_s, periods_n, (rate, period_s) in needs:
             if value_s < periods_n * period_s - 1e-9:
                 yield (
                     f"{name} ({value_s:g}) is shorter than {periods_n} periods of {rate} ({1.0 / period_s:g}): what it "
                     "watches could not come in time; raise the one or the other"
                 )
-        unseen_deg = rotation.speed_deg_per_s * blind_s
+        unseen_deg = rotation.speed_deg_per_s * max(unseen_s)
         if unseen_deg > UNSEEN_DEG:
             yield (
-                f"rotation.speed_deg_per_s ({rotation.speed_deg_per_s:g}) with rotation.max_age_s, goal_timeout_s and "
-                f"watchdog_s lets the blade turn {unseen_deg:.0f}° with nobody watching, {UNSEEN_DEG:g}° at most; "
-                "lower the one or the others"
+                f"rotation.speed_deg_per_s ({rotation.speed_deg_per_s:g}) with rotation.max_age_s, goal_timeout_s "
+                f"and watchdog_s lets the blade turn {unseen_deg:.0f}° with nobody watching, "
+                f"{UNSEEN_DEG:g}° at most: lower the one or the others"
             )
         for axis, section in self.lifts().items():
             if pair.reading_max_age_s > section.max_age_s:
@@ -252,9 +256,7 @@ class Config(Settings):
                     f"lift_pair.reading_max_age_s ({pair.reading_max_age_s:g}) is above {axis}.max_age_s "
                     f"({section.max_age_s:g}): the pair would never name the side that is lost; lower it"
                 )
-            if not isinstance(section, ElectrakSettings):
-                continue
-            if pair.min_share * section.speed_percent < LEAST_DUTY_PERCENT:
+            if isinstance(section, ElectrakSettings) and pair.min_share * section.speed_percent < LEAST_DUTY_PERCENT:
                 yield (
                     f"lift_pair.min_share ({pair.min_share:g}) of {axis}.speed_percent ({section.speed_percent}) is "
                     f"below the {LEAST_DUTY_PERCENT} % duty at which a lift moves; raise it"
@@ -277,6 +279,7 @@ class Config(Settings):
                 lead=rotation.lead_deg,
                 tolerance=rotation.tolerance_deg,
                 max_age_s=rotation.max_age_s,
+                profile_in_device=rotation.profile_in_device,
             ),
             **{name: _actuator_figures(section) for name, section in self.actuators().items()},
         }

@@ -30,6 +30,7 @@ class AxisFigures:
     In the axis's unit (see :data:`UNITS`) and seconds. ``low``, ``high``: absolute bounds. ``window``: largest distance
     from where the axis stood when it was armed. ``lead``: largest distance of the goal ahead of the measured position.
     ``tolerance``: so near the goal counts as arrived. ``max_age_s``: an older reading counts as unknown.
+    ``profile_in_device``: the device itself moves with ``speed`` and ``acceleration``; the gate leads it to the goal.
     """
 
     low: float
@@ -40,6 +41,7 @@ class AxisFigures:
     lead: float
     tolerance: float
     max_age_s: float
+    profile_in_device: bool = False
 
 
 @dataclass(frozen=True, slots=True)

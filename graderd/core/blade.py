@@ -39,6 +39,28 @@ def blade_coordinates(x: Array, y: Array, angle_deg: float) -> tuple[Array, Arra
     return -x * sin + y * cos, x * cos + y * sin
 
 
+STEEPEST_MEETING_DEG = 75.0
+"""Turned further than this a blade meets hardly anything: where soil would meet it is no longer asked."""
+
+
+def meeting_point(s: Array, d: Array, angle_deg: float) -> tuple[Array, Array]:
+    """Where along a blade that travels straight ahead soil at ``(s, d)`` will meet it, and after how much travel (m).
+
+    Soil keeps its y while the blade comes nearer along x. With d counted from the face, which the blade carries round
+    its axis, soil lies at ``y = (d + x_offset) sin a + s cos a`` and meets the face, d = 0, at the same y:
+    ``s_met cos a = s cos a + d sin a``, so ``s_met = s + d tan a``. The travel is the difference in x:
+    ``d cos a + (s_met - s) sin a = d / cos a``. Both grow without bound as the blade turns along the travel; looking
+    ahead by a fixed travel keeps them bounded, since ``s_met - s = travel sin a``.
+
+    Raises:
+        ValueError: the blade is turned by more than :data:`STEEPEST_MEETING_DEG`.
+    """
+    if abs(angle_deg) > STEEPEST_MEETING_DEG:
+        raise ValueError(f"a blade turned by {angle_deg:.0f} degrees has no soil ahead of it")
+    angle = np.deg2rad(angle_deg)
+    return s + d * np.tan(angle), d / np.cos(angle)
+
+
 def third_bounds_m(length_m: float) -> tuple[float, float]:
     """s of the two borders between the thirds: right|center and center|left."""
     return -length_m / 6.0, length_m / 6.0

@@ -1,8 +1,8 @@
 """The gate: the only way out. Every goal passes here, or the axis stays where it is.
 
 Order of the checks, the first that fails decides: mode, lease, finite number, fresh measurement, interlocks, then the
-bounds (absolute limits and the working window around the armed pose) and the motion limits (speed, acceleration, and
-how far the goal may run ahead of the measured position).
+bounds (absolute limits and the working window around the armed pose) and the motion limits (how far the goal may run
+ahead of the measured position; speed and acceleration where the device has no profile of its own).
 A goal beyond a bound is not "corrected": it is limited to the bound and the result says so.
 
 Of the lifts, the speed is the lift pair's: it is asked with the goals that may be gone to, and what it says passes
@@ -49,6 +49,7 @@ class Setpoint:
     """Where an axis's goal is now and how fast it moves, per second; ``armed_at`` is the middle of its window.
 
     ``moved_at``: where the axis was when it last moved; ``standing_s``: since when it has not followed its goal.
+    ``held``: it was not let move in the tick before, so that it starts from where it is now.
     """
 
     position: float
@@ -56,6 +57,7 @@ class Setpoint:
     armed_at: float
     moved_at: float | None = None
     standing_s: float = 0.0
+    held: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,15 +114,20 @@ def pass_gate(
         if result.bounded is None or wanted is None or measured is None:
             # A held axis starts again from where it is measured, at rest: no jump to an old setpoint.
             at = former.position if measured is None or not math.isfinite(measured) else measured
-            setpoints[axis] = Setpoint(at, 0.0, former.armed_at)
+            setpoints[axis] = Setpoint(at, 0.0, former.armed_at, held=True)
             continue
+        if former.held:
+            former = Setpoint(measured, 0.0, former.armed_at)
         figures = inputs.figures[axis]
         if axis in LIFTS:
             advanced = replace(former, position=_bound(wanted, figures, former.armed_at)[0])
             setpoints[axis] = _lead(advanced, measured, figures, figures.lead)
         else:
-            advanced = _fence(_advance(former, wanted, figures, dt_s), former, figures)
-            advanced = _watch(advanced, measured, figures, dt_s)
+            if figures.profile_in_device:  # a second profile before the device's own would only fight it
+                advanced = replace(former, position=wanted, speed=0.0)
+            else:
+                advanced = _fence(_advance(former, wanted, figures, dt_s), former, figures)
+            advanced = _watch(advanced, measured, figures, inputs.dt_s)
             setpoints[axis] = _lead(advanced, measured, figures, _lead_of(advanced, figures))
         passed[axis] = replace(result, limited=setpoints[axis].position)
     return GateState(setpoints), passed

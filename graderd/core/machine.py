@@ -15,7 +15,7 @@ from pydantic import Field
 from graderd.core import commands as cmd
 from graderd.core.axes import PARTS, Goals, Pose
 from graderd.core.faults.monitor import ActiveFault, Reaction, held_axes, worst
-from graderd.core.rule import Decision, RuleSettings, decide
+from graderd.core.rule import Decision, RuleSettings, Travel, decide
 from graderd.core.soil import SoilObservation
 from graderd.hal.settings import Positive, Settings
 
@@ -30,6 +30,7 @@ class Mode(StrEnum):
 
 
 ARMED = (Mode.MANUAL, Mode.AUTO)
+STANDSTILL = "daemon.loop_blocked"
 
 
 class MachineSettings(Settings):
@@ -87,7 +88,8 @@ class State:
 class Inputs:
     """What is known at one tick.
 
-    ``observation``: a new one, not handed in before. ``settled``: every commanded axis is at its goal, or at the bound
+    ``observation``: a new one, not handed in before. ``travel``: how the machine drives, None where it does not say.
+    ``settled``: every commanded axis is at its goal, or at the bound
     the gate lets it have; ``arrived``: at its goal. ``held``: why an axis with a goal was not let move, by axis.
     All three speak of the goals of the tick before.
     ``devices_active``: all required devices are ACTIVE. ``arm_error``: why arming the devices failed, once.
@@ -98,6 +100,7 @@ class Inputs:
     resolve: Callable[[cmd.Jog | cmd.Preset, Pose], tuple[Goals, ...] | str]
     commands: tuple[cmd.Command, ...] = ()
     observation: SoilObservation | None = None
+    travel: Travel | None = None
     pose: Pose = field(default_factory=Pose)
     settled: bool = True
     arrived: bool = True
@@ -169,13 +172,19 @@ def _react(state: State, inputs: Inputs) -> State:
         return state
     if fault is not None and fault.row.reaction >= Reaction.DISARM:
         if state.mode is not Mode.DISARMED or state.arming_since_s is not None:
-            return _disarmed(state, f"{fault.name}: {fault.row.reads}")
+            return _disarmed(state, _own_standstill(inputs) or f"{fault.name}: {fault.row.reads}")
         return state
     if state.mode in ARMED and not inputs.devices_active:
-        return _disarmed(state, "a device left its active state")
+        return _disarmed(state, _own_standstill(inputs) or "a device left its active state")
     if fault is not None and fault.row.reaction is Reaction.RETREAT and state.mode is Mode.AUTO:
         return _manual(state, f"{fault.name}: {fault.row.reads}")
     return state
+
+
+def _own_standstill(inputs: Inputs) -> str:
+    """Why devices seem lost just after the daemon itself stood still; empty where it did not. Their silence is its own
+    deafness: nobody needs to look at their power for that, and a device that is really lost is told afterwards."""
+    return next((f"{f.name}: {f.row.reads}" for f in inputs.faults if f.present and f.name == STANDSTILL), "")
 
 
 def _lapse(state: State, now_s: float) -> State:
@@ -311,7 +320,7 @@ def _advance(state: State, inputs: Inputs, settings: MachineSettings, rule: Rule
         decision = (
             Decision()
             if "rotation" in held
-            else decide(state.decision, inputs.observation, inputs.settled, inputs.now_s, rule)
+            else decide(state.decision, inputs.observation, inputs.settled, inputs.now_s, rule, inputs.travel)
         )
         state = replace(state, decision=decision, goals=Goals(rotation_deg=decision.angle_deg))
     if state.mode in ARMED:

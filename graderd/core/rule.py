@@ -2,6 +2,9 @@
 
 Soil left: 30° counter-clockwise. Right: 30° clockwise. Center: 15° counter-clockwise. Spread evenly: the 45° base
 working angle. None or unknown: the present angle is held.
+
+A pass has one decision. It is taken from the soil ahead and kept while the machine drives through it: what the blade
+carries spreads along it, whatever was decided, and would undo the decision. See docs/adr/0006.
 """
 
 from __future__ import annotations
@@ -11,16 +14,16 @@ from dataclasses import dataclass, replace
 from pydantic import Field, model_validator
 
 from graderd.core.soil import SoilObservation, Zone
-from graderd.hal.settings import Finite, NotNegative, Settings
+from graderd.hal.settings import Finite, NotNegative, Positive, Settings
 
 TURNING_ZONES = (Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN)
 
 
 class RuleSettings(Settings):
-    """Angles of the rule and the sureness it asks for.
+    """Angles of the rule, the sureness it asks for, and what a pass is.
 
-    A swing itself shifts soil between the thirds (they turn with the blade), so a *change* of decision asks for
-    more than a first one: ``switch_share`` of the soil in the new third, after ``dwell_s``.
+    A swing itself shifts soil, so a *change* of decision before the machine has started asks for more than a first one:
+    ``switch_share`` of the soil ahead in the new third, after ``dwell_s``. Afterwards it is kept until the pass ends.
     """
 
     left_deg: Finite = Field(30.0, ge=-180, le=180)
@@ -33,6 +36,18 @@ class RuleSettings(Settings):
     min_confidence: float = Field(0.3, ge=0, le=1)
     dwell_s: NotNegative = Field(2.0, le=60, description="least time between two decisions")
     switch_share: float = Field(0.7, ge=0, le=1, description="share of soil a third needs to overturn a decision")
+    standing_m_per_s: Positive = Field(
+        0.03, description="slower counts as standing; wheel speed reads to 0.001 m/s and few senders below 0.02"
+    )
+    standing_s: NotNegative = Field(
+        0.5, description="standing so long ends the pass; a wheel that slips or a gear change ends none"
+    )
+    pass_m: Positive = Field(
+        10.0, description="a pass ends after so much travel: another 8 m bed begins, or the site goes on and on"
+    )
+    pass_s: Positive = Field(
+        32.0, description="without speed or travel, after so much time: 8 m at 0.25 m/s, the slowest work"
+    )
 
     @model_validator(mode="after")
     def _votes(self) -> RuleSettings:
@@ -53,53 +68,148 @@ class RuleSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True)
+class Travel:
+    """How the machine drives: forward is positive. ``travelled_m`` counts from anywhere; only differences mean
+    something. A speed without a sign (J1939) cannot tell reverse."""
+
+    speed_m_per_s: float
+    travelled_m: float
+
+
+@dataclass(frozen=True, slots=True)
 class Decision:
-    """What automatic operation has decided, and the votes on the way to the next decision."""
+    """What automatic operation has decided, for which pass, and the votes on the way to the next decision.
+
+    ``ended``: why the pass it was taken for is over; empty while it is kept. One that is not kept holds its angle until
+    the next one. ``begun``: the machine drives, or may (it does not say), so that the decision is kept whatever
+    is seen. ``at_m``: travelled at the decision; ``since_m``: so far since then; both None where it does not say.
+    """
 
     zone: Zone | None = None
     angle_deg: float | None = None
     decided_s: float = float("-inf")
     votes: tuple[SoilObservation, ...] = ()
+    ended: str = ""
+    begun: bool = False
+    at_m: float | None = None
+    since_m: float | None = None
+    standing_since_s: float | None = None
 
     @property
-    def reason(self) -> str:
+    def kept(self) -> bool:
+        """Whether it stands for a pass that is not over."""
+        return self.zone is not None and not self.ended
+
+    def reason(self, now_s: float) -> str:
         """One line for people."""
         if self.zone is None:
             return "no decision yet"
-        return f"soil {self.zone}: {self.angle_deg:+.0f}°"
+        if self.ended:
+            return f"{self.zone}, until the next pass: {self.ended}"
+        since = f"{now_s - self.decided_s:.1f} s" if self.since_m is None else f"{self.since_m:.1f} m"
+        return f"{self.zone}, kept for this pass since {since}" if self.begun else f"{self.zone}, before the pass"
 
 
 def decide(
-    decision: Decision, observation: SoilObservation | None, settled: bool, now_s: float, rule: RuleSettings
+    decision: Decision,
+    observation: SoilObservation | None,
+    settled: bool,
+    now_s: float,
+    rule: RuleSettings,
+    travel: Travel | None = None,
 ) -> Decision:
     """Take one new observation (or None) into account and return the decision that now holds.
 
-    ``settled`` is whether the blade stands at its goal: while it swings, votes are dropped, because the soil and the
-    thirds are moving against each other.
+    ``settled`` is whether the blade stands at its goal: while it swings, votes are dropped, because the blade and the
+    soil are moving against each other. ``travel`` None: the machine does not say how it drives.
     """
-    if not settled:
-        return replace(decision, votes=()) if decision.votes else decision
-    # A picture far ahead of the clock would never grow old: it counts as little as one far behind it.
-    votes = tuple(v for v in decision.votes if abs(now_s - v.capture_s) <= rule.vote_max_age_s)
-    if observation is not None and abs(now_s - observation.capture_s) <= rule.vote_max_age_s:
-        votes = (*votes, observation)[-rule.votes_window_n :]
-    decision = replace(decision, votes=votes)
+    votes = _votes(decision.votes, observation, now_s, rule) if settled else ()
+    decision = _pass(replace(decision, votes=votes), now_s, rule, travel)
     if now_s - decision.decided_s < rule.dwell_s:
         return decision
     winner = _winner(decision, rule)
-    if winner is None or winner == decision.zone:
+    if winner is None or (winner is decision.zone and decision.kept):
         return decision
-    return Decision(zone=winner, angle_deg=rule.angle_deg(winner), decided_s=now_s)
+    drives = travel is None or abs(travel.speed_m_per_s) >= rule.standing_m_per_s
+    return Decision(
+        zone=winner,
+        angle_deg=rule.angle_deg(winner),
+        decided_s=now_s,
+        begun=drives,
+        at_m=travel.travelled_m if travel else None,
+        since_m=0.0 if travel else None,
+    )
+
+
+def _votes(
+    votes: tuple[SoilObservation, ...], new: SoilObservation | None, now_s: float, rule: RuleSettings
+) -> tuple[SoilObservation, ...]:
+    # A picture far ahead of the clock would never grow old: it counts as little as one far behind it.
+    kept = tuple(v for v in votes if abs(now_s - v.capture_s) <= rule.vote_max_age_s)
+    if new is not None and abs(now_s - new.capture_s) <= rule.vote_max_age_s:
+        kept = (*kept, new)[-rule.votes_window_n :]
+    return kept
+
+
+def _pass(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel | None) -> Decision:
+    """Follow the pass that the decision is kept for, and end it where it ends."""
+    if not decision.kept:
+        return decision
+    decision = _driven(decision, now_s, rule, travel)
+    stood_s = 0.0 if decision.standing_since_s is None else now_s - decision.standing_since_s
+    ended, gone = "", _agreeing(decision.votes, rule, Zone.NONE)
+    if travel is not None and travel.speed_m_per_s <= -rule.standing_m_per_s:
+        ended = "the machine reversed"
+    elif decision.begun and stood_s >= rule.standing_s:
+        ended = "the machine stands"
+    elif decision.since_m is not None and decision.since_m >= rule.pass_m:
+        ended = f"{rule.pass_m:g} m were travelled"
+    elif decision.since_m is None and now_s - decision.decided_s >= rule.pass_s:
+        ended = f"{rule.pass_s:g} s went by"
+    elif gone and all(v.zone is Zone.NONE for v in gone):  # nor is any carried
+        ended = "the soil is gone"
+    # What was seen in one pass says nothing about the next.
+    return replace(decision, ended=ended, votes=(), standing_since_s=None) if ended else decision
+
+
+def _driven(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel | None) -> Decision:
+    if travel is None:
+        # Not said any more, or never: kept, since it may drive; from here on the time counts.
+        return replace(decision, begun=True, at_m=None, since_m=None, standing_since_s=None)
+    at_m = travel.travelled_m if decision.at_m is None else decision.at_m
+    since_m = travel.travelled_m - at_m
+    drives = abs(travel.speed_m_per_s) >= rule.standing_m_per_s
+    standing_since_s = None if drives else decision.standing_since_s if decision.standing_since_s is not None else now_s
+    return replace(
+        decision,
+        begun=decision.begun or drives,
+        at_m=at_m,
+        since_m=since_m,
+        standing_since_s=standing_since_s,
+    )
 
 
 def _winner(decision: Decision, rule: RuleSettings) -> Zone | None:
     for zone in TURNING_ZONES:
-        agreeing = [v for v in decision.votes if v.zone is zone and v.confidence >= rule.min_confidence]
-        if len(agreeing) < rule.votes_needed_n:
-            continue
-        if decision.zone is not None and zone not in (decision.zone, Zone.EVEN):
-            mean_share = sum(v.share_of(zone) for v in agreeing) / len(agreeing)
-            if mean_share < rule.switch_share:
-                continue
-        return zone
+        agreeing = _agreeing(decision.votes, rule, zone)
+        if agreeing and (not decision.kept or zone is decision.zone or _may_follow(decision, zone, agreeing, rule)):
+            return zone
     return None
+
+
+def _may_follow(decision: Decision, zone: Zone, agreeing: list[SoilObservation], rule: RuleSettings) -> bool:
+    """Whether ``zone`` may take the place of a decision in the pass that this was taken for.
+
+    Even is a job of its own, flattening: it follows on scattering where what *comes* lies evenly, once.
+    """
+    if zone is Zone.EVEN:
+        return all(v.ahead is not None for v in agreeing)
+    return not decision.begun and sum(v.coming.litres.share_of(zone) for v in agreeing) >= rule.switch_share * len(
+        agreeing
+    )
+
+
+def _agreeing(votes: tuple[SoilObservation, ...], rule: RuleSettings, zone: Zone) -> list[SoilObservation]:
+    """The sure votes for what comes, where they are enough."""
+    sure = [v for v in votes if v.coming.zone is zone and v.coming.confidence >= rule.min_confidence]
+    return sure if len(sure) >= rule.votes_needed_n else []

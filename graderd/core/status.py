@@ -16,7 +16,9 @@ class _Status(BaseModel):
 class AxisStatus(_Status):
     """One axis, in degrees (rotation) or millimetres: requested, limited, sent and measured are all visible.
 
-    ``arrived``: it stands where it was asked to go, within its tolerance."""
+    ``arrived``: it stands where it was asked to go, within its tolerance. What was measured is None once it is older
+    than control would act on; what changes slowly (voltage, temperature, torque, flags), once it is older than 5 s.
+    ``measured_age_s`` goes on telling how old the last position is."""
 
     name: str
     unit: str
@@ -50,8 +52,26 @@ class AttitudeStatus(_Status):
     pitch_deg: float | None = None
 
 
+class ThirdsStatus(_Status):
+    """Litres by the third of the blade."""
+
+    left_l: float
+    center_l: float
+    right_l: float
+
+
+class AheadStatus(ThirdsStatus):
+    """The soil that the blade will meet, by the third that will meet it; a decision is taken from this."""
+
+    zone: Zone
+    confidence: float
+    reason: str
+
+
 class SoilStatus(_Status):
-    """The newest observation of the soil."""
+    """The newest observation of the soil: all that lies in front of the blade, and told apart what lies ahead and what
+    it carries; these two are null where the method has no depth. Once its picture is too old, ``zone`` is unknown, and
+    so is the rest."""
 
     zone: Zone = Zone.UNKNOWN
     confidence: float = 0.0
@@ -63,6 +83,8 @@ class SoilStatus(_Status):
     volume_left_l: float | None = None
     volume_center_l: float | None = None
     volume_right_l: float | None = None
+    ahead: AheadStatus | None = None
+    carried: ThirdsStatus | None = None
     blade_angle_deg: float | None = None
     frame_number_n: int = -1
     frames_per_s: float = 0.0
@@ -70,12 +92,23 @@ class SoilStatus(_Status):
 
 
 class DecisionStatus(_Status):
-    """What automatic operation decided last."""
+    """What automatic operation decided last. ``kept``: it stands for a pass that is not over, for ``since_m`` so far
+    (null where the machine does not tell its travel)."""
 
     zone: Zone | None = None
     angle_deg: float | None = None
     age_s: float | None = None
+    kept: bool = False
+    since_m: float | None = None
     reason: str = ""
+
+
+class VehicleStatus(_Status):
+    """How the machine drives, as far as it says."""
+
+    speed_m_per_s: float | None = None
+    travelled_m: float | None = None
+    age_s: float | None = None
 
 
 class FaultStatus(_Status):
@@ -141,6 +174,7 @@ class Status(_Status):
     stop_n: int = 0
     soil: SoilStatus = SoilStatus()
     decision: DecisionStatus = DecisionStatus()
+    vehicle: VehicleStatus = VehicleStatus()
     axes: dict[str, AxisStatus] = {}
     attitude: AttitudeStatus = AttitudeStatus()
     faults: tuple[FaultStatus, ...] = ()

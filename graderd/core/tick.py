@@ -22,13 +22,14 @@ from graderd.core.machine import ARMED, Inputs, Intents, MachineSettings, Mode, 
 from graderd.core.motion import resolve
 from graderd.core.plausibility import AxisSample, MotionFigures, PlausibilityMonitor, axis_sample
 from graderd.core.readiness import AxisReadiness, Requirement, requirements
-from graderd.core.rule import RuleSettings
+from graderd.core.rule import RuleSettings, Travel
 from graderd.core.soil import SoilObservation
 from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry
+from graderd.hal.vehicle import VehicleTelemetry
 
 BLOCKED_S = 0.5
 """A tick this late: goals have timed out and the servo's watchdog (0.2 s by default) has tripped meanwhile."""
@@ -41,6 +42,7 @@ class TickSettings:
 
     ``motion``: what is plausible for each axis. ``overrun_s``: a tick later than this is a fault.
     ``max_frame_age_s``: the soil of an older picture is unknown.
+    ``max_vehicle_age_s``: with older readings it is not known how the machine drives.
     """
 
     figures: Mapping[str, AxisFigures]
@@ -53,6 +55,7 @@ class TickSettings:
     presets: Mapping[str, Preset] = field(default_factory=dict)
     overrun_s: float = 0.1
     max_frame_age_s: float = 0.5
+    max_vehicle_age_s: float = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +75,7 @@ class Sensed:
     the tick before, in their order. ``observation``: a new one, once. ``powered``: every device is ACTIVE and none is
     being armed or disarmed. ``arm_error``: why arming the devices failed, once. ``refused``: what a driver said to the
     goal of the tick before, by axis. ``late_s``: how much later than planned this tick comes.
+    ``vehicle``: how the machine drives.
     """
 
     now_s: float
@@ -83,6 +87,7 @@ class Sensed:
     arm_error: str = ""
     refused: Mapping[str, str] = field(default_factory=dict)
     late_s: float = 0.0
+    vehicle: VehicleTelemetry = field(default_factory=VehicleTelemetry)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,9 +144,10 @@ class Tick:
 class Controller:
     """All memory between two ticks. One per machine; :meth:`step` is its only way in."""
 
-    def __init__(self, settings: TickSettings) -> None:
+    def __init__(self, settings: TickSettings, state: State | None = None) -> None:
+        """``state``: where the machine begins, if it is not disarmed."""
         self._settings = settings
-        self._state = State()
+        self._state = state or State()
         self._faults = FaultState()
         self._gate = GateState()
         self._lift = LiftCoordinator(settings.lift_pair, settings.figures)
@@ -175,6 +181,7 @@ class Controller:
                 resolve=lambda command, at: resolve(command, at, settings.attitude, settings.presets, settings.figures),
                 commands=sensed.commands,
                 observation=sensed.observation,
+                travel=_travel(sensed.vehicle, now_s, settings.max_vehicle_age_s),
                 pose=pose,
                 settled=self._settled(pose),
                 arrived=self._arrived(pose),
@@ -335,6 +342,11 @@ def _samples(sensed: Sensed) -> Iterator[AxisSample]:
         sample = axis_sample(axis, told.lifecycle, told.telemetry)
         if sample is not None:
             yield sample
+
+
+def _travel(vehicle: VehicleTelemetry, now_s: float, max_age_s: float) -> Travel | None:
+    speed, travelled = (_fresh(reading, now_s, max_age_s) for reading in (vehicle.speed_m_per_s, vehicle.travelled_m))
+    return None if speed is None or travelled is None else Travel(speed, travelled)
 
 
 def _side(sensed: Sensed, axis: str) -> SideReading | None:

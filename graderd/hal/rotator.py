@@ -70,8 +70,9 @@ class Rotator(Protocol):
     async def open(self) -> None:
         """closed -> standby: open the wire, identify and judge the device, start reading telemetry.
 
-        Nothing moves and torque is left as it is. After a successful open the implementation keeps the
-        connection by itself: a lost device makes it FAILED and it retries until it is in STANDBY again.
+        Nothing begins to move and torque is left as it is; a device found on its way somewhere holds first. After a
+        successful open the implementation keeps the connection by itself: a lost device makes it FAILED and it retries
+        until it is in STANDBY again.
 
         Raises:
             DeviceMissingError: no such port.
@@ -102,7 +103,7 @@ class Rotator(Protocol):
         ...
 
     def hold(self) -> None:
-        """Stop where the blade is: goal := measured with the next packet. Allowed in every state, idempotent."""
+        """Stop with the next packet, as soon as the blade can without turning back. Allowed always, idempotent."""
         ...
 
     async def disarm(self) -> None:

@@ -6,14 +6,30 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
+from graderd.hal.settings import Settings
+
+
+class NoArguments(Settings):
+    """Of a service that takes none."""
+
 
 @dataclass(frozen=True, slots=True)
 class DeviceService:
-    """``run`` takes the request's arguments, returns a JSON object, and raises ``DeviceError`` where it cannot.
+    """``run`` takes the request's arguments as ``arguments`` describes them, returns a JSON object, and raises
+    ``DeviceError`` where it cannot.
 
     ``only_reads``: it may be asked for in every mode and without consent. All others may move or unpower something:
-    they need a disarmed machine and somebody who has looked.
+    they need a disarmed machine and somebody who has looked, and run one at a time. ``moves``: it moves the machine for
+    as long as it runs, and is cancelled when the client that asked for it goes.
     """
 
-    run: Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
+    run: Callable[[Any], Awaitable[dict[str, Any]]]
     only_reads: bool = False
+    moves: bool = False
+    arguments: type[Settings] = NoArguments
+    summary: str = "A device service outside the control loop"
+
+
+WatchBus = Callable[[Callable[[str], None]], Callable[[], None]]
+"""Calls a listener with everything on a wire from now on, received or sent, each a line of text; returns the call that
+ends it. Nobody listening costs nothing."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, JsonValue, Tag, model_validator
 
@@ -21,7 +21,7 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 PROFILE_MARGIN = 1.2
-"""The servo's profile over the goal's speed and acceleration."""
+"""A driver follows a goal that the gate moves by so much faster: following it is no second regulator."""
 
 
 class Settings(BaseModel):
@@ -70,16 +70,22 @@ DriverTable = Annotated[
 
 
 class RotatorSettings(Settings):
-    """Blade rotation, whatever turns it."""
+    """Blade rotation, whatever turns it.
+
+    ``profile_in_device``: speed and acceleration live in the device, which takes a far goal; else the gate moves the
+    goal by them.
+    """
+
+    profile_in_device: ClassVar[bool] = False
 
     backend: Annotated[str, _one_of("ph54")] = Field("ph54", description="driver: ph54, or package.module:NAME")
-    min_deg: Finite = Field(-60.0, ge=-180, le=180, description="limit at the blade, for gate and servo alike")
-    max_deg: Finite = Field(60.0, ge=-180, le=180, description="limit at the blade, for gate and servo alike")
+    min_deg: Finite = Field(-60.0, ge=-180, le=180, description="limit at the blade, for gate and driver alike")
+    max_deg: Finite = Field(60.0, ge=-180, le=180, description="limit at the blade, for gate and driver alike")
     window_deg: Positive = Field(
         120.0, le=360, description="largest distance from where the blade stood when it was armed; 360: no window"
     )
     speed_deg_per_s: Positive = Field(
-        25.0, le=90, description="largest speed of the goal, half the servo's own at most; its profile leaves room"
+        25.0, le=90, description="largest speed of the blade, half the servo's own at most"
     )
     acceleration_deg_per_s2: Positive = Field(
         50.0, ge=5, le=1000, description="largest change of that speed; the servo brakes with it, so not too little"
@@ -87,7 +93,8 @@ class RotatorSettings(Settings):
     lead_deg: Positive = Field(
         10.0,
         le=20,
-        description="how far the goal may run ahead of a blade that is held back: it springs so far when freed",
+        description="how far the goal may be ahead of the blade: it moves on so far when freed; less than "
+        "speed²/2·acceleration slows it down",
     )
     tolerance_deg: Positive = Field(0.5, le=3, description="so near the goal counts as arrived, and as no movement")
     max_age_s: Positive = Field(
@@ -112,13 +119,13 @@ class RotatorSettings(Settings):
 
     @property
     def profile_velocity_deg_per_s(self) -> float:
-        """The driver's own profile: faster than the goal moves, so that following it is no second regulator."""
-        return PROFILE_MARGIN * self.speed_deg_per_s
+        """The driver's own profile; see :attr:`profile_in_device`."""
+        return self.speed_deg_per_s * (1.0 if self.profile_in_device else PROFILE_MARGIN)
 
     @property
     def profile_acceleration_deg_per_s2(self) -> float:
         """See :attr:`profile_velocity_deg_per_s`; this is also how hard an ordinary stop brakes."""
-        return PROFILE_MARGIN * self.acceleration_deg_per_s2
+        return self.acceleration_deg_per_s2 * (1.0 if self.profile_in_device else PROFILE_MARGIN)
 
 
 class Ph54Settings(RotatorSettings):
@@ -127,6 +134,8 @@ class Ph54Settings(RotatorSettings):
     Calibration: ``blade_deg = sign * servo_deg / gear_ratio - zero_deg`` with servo_deg from the device's own zero
     (Homing Offset stays 0).
     """
+
+    profile_in_device: ClassVar[bool] = True
 
     port: str = Field("/dev/graderd/servo", description="serial port, or a udev symlink to it")
     usb_serial_number: str = Field("", description="find the port by the adapter's USB serial number; empty: use port")
@@ -247,8 +256,8 @@ class ElectrakSettings(ActuatorSettings):
 class PluginActuatorSettings(ActuatorSettings):
     """One linear actuator by a driver from elsewhere; its stroke is not graderd's to guess."""
 
-    min_mm: NotNegative = Field(description="limit of extension, for gate and driver alike")
-    max_mm: Positive = Field(description="limit of extension, for gate and driver alike")
+    min_mm: NotNegative = Field(le=1000, description="limit of extension, for gate and driver alike")
+    max_mm: Positive = Field(le=1000, description="limit of extension, for gate and driver alike")
     driver: DriverTable
 
 
@@ -297,6 +306,19 @@ AnyStopInputSettings = Annotated[
 DepthPreset = Literal["custom", "default", "hand", "high_accuracy", "high_density", "medium_density"]
 DEPTH_PRESETS: tuple[str, ...] = get_args(DepthPreset)
 """In the order of their numbers (librealsense, ``rs2_rs400_visual_preset``)."""
+
+
+class VehicleSettings(Settings):
+    """Where the machine's speed comes from. Without it a decision is kept by time instead of travel."""
+
+    source: Literal["none", "j1939", "simulated"] = Field(
+        "none", description="j1939: wheel-based speed (PGN 65265, SPN 84) on the bus of the actuators"
+    )
+    address_n: int | None = Field(
+        None, ge=0, le=253, description="j1939: believe this address alone; none: whichever sends it, one at a time"
+    )
+    path: str = Field("", description="simulated: the rig's control socket")
+    max_age_s: Positive = Field(0.5, description="an older speed counts as unknown; J1939 sends it every 0.1 s")
 
 
 class CameraSettings(Settings):

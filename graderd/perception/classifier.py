@@ -6,13 +6,14 @@ import math
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
-from graderd.core.soil import PictureFault, SoilObservation, Zone
+from graderd.core.soil import PictureFault, SoilAhead, SoilObservation, Thirds, Zone
 from graderd.hal.camera import Frame, Intrinsics
 from graderd.hal.settings import CameraSettings
 from graderd.perception import annotate as drawing
@@ -59,6 +60,19 @@ class Classifier(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """What a healthy picture says: all soil, and where the method has depth that ahead and that carried (litres)."""
+
+    verdict: Verdict
+    ahead: Verdict | None = None
+    carried_l: tuple[float, float, float] | None = None
+
+    def unknown(self, reason: str) -> _Judged:
+        """The same numbers, not believed."""
+        return _Judged(self.verdict.unknown(reason), self.ahead and self.ahead.unknown(reason), self.carried_l)
+
+
 class SoilClassifier:
     """The one implementation; ``settings.method`` chooses what it does with a healthy frame."""
 
@@ -98,15 +112,15 @@ class SoilClassifier:
         start_s = time.thread_time()
         method = self._settings.method
         faults = self._health.check(frame, needs_depth=method in ("depth", "fused"), needs_color=method != "depth")
-        verdict = Verdict(Zone.UNKNOWN, 0.0, "")
+        judged = _Judged(Verdict(Zone.UNKNOWN, 0.0, ""))
         if not faults:
-            verdict, more = self._judge(frame, Stance(blade_angle_deg, attitude))
+            judged, more = self._judge(frame, Stance(blade_angle_deg, attitude))
             faults += more
         if faults:
-            verdict = verdict.unknown("; ".join(f"{fault.condition}: {fault.detail}" for fault in faults))
+            judged = judged.unknown("; ".join(f"{fault.condition}: {fault.detail}" for fault in faults))
         elif blade_angle_age_s > self._settings.decision.max_angle_age_s:
-            verdict = verdict.unknown(f"the blade angle was {blade_angle_age_s:.2f} s old at capture")
-        return self._observation(frame, verdict, blade_angle_deg, blade_angle_age_s, faults, start_s)
+            judged = judged.unknown(f"the blade angle was {blade_angle_age_s:.2f} s old at capture")
+        return self._observation(frame, judged, blade_angle_deg, blade_angle_age_s, faults, start_s)
 
     def annotate(self, frame: Frame, observation: SoilObservation) -> U8:
         """See :class:`Classifier`."""
@@ -175,33 +189,33 @@ class SoilClassifier:
             self._judges[view.lens] = DepthJudge(view, self._blade, self._settings.depth, self._settings.decision)
         return self._judges[view.lens]
 
-    def _judge(self, frame: Frame, stance: Stance) -> tuple[Verdict, list[PictureFault]]:
+    def _judge(self, frame: Frame, stance: Stance) -> tuple[_Judged, list[PictureFault]]:
         settings = self._settings
         region: Region | None = None
         if self._health.lit:
             region = self._region(frame, stance.angle_deg)
             if region is None:
-                return Verdict(
-                    Zone.UNKNOWN, 0.0, "the blade is not in the picture at this angle, or the picture is too small"
-                ), []
+                reason = "the blade is not in the picture at this angle, or the picture is too small"
+                return _Judged(Verdict(Zone.UNKNOWN, 0.0, reason)), []
             faults = self._health.blurred(frame.color_bgr, region)
             if faults:
-                return Verdict(Zone.UNKNOWN, 0.0, ""), faults
+                return _Judged(Verdict(Zone.UNKNOWN, 0.0, "")), faults
         by_color = BY_COLOR.get(settings.method)
         if by_color is not None:
             assert region is not None  # an unlit picture is a fault where colour is needed
             verdict = by_color(frame.color_bgr, region, settings.color, settings.decision)
-            return self._said(frame, verdict), self._seen_meanwhile(frame, stance)
+            return _Judged(self._said(frame, verdict)), self._seen_meanwhile(frame, stance)
         judge = self._depth_judge(frame)
         if judge is None or frame.depth_mm is None:
-            return Verdict(Zone.UNKNOWN, 0.0, "no calibration of the depth picture applies"), []
+            return _Judged(Verdict(Zone.UNKNOWN, 0.0, "no calibration of the depth picture applies")), []
         soil = judge.height_map(frame.depth_mm, stance)
-        by_depth = judge.verdict(soil)
+        by_depth, ahead = judge.verdict(soil), judge.verdict_ahead(soil)
         faults = self._seen(soil, stance)
         if region is None or settings.method == "depth" or faults:
-            return by_depth, faults
+            return _Judged(by_depth, ahead, soil.carried_l), faults
         cross_check = fast_color_verdict(frame.color_bgr, region, settings.color, settings.decision)
-        return fuse(by_depth, cross_check), []
+        # Colour cannot tell ahead from carried: what it sees before the blade objects to either.
+        return _Judged(fuse(by_depth, cross_check), fuse(ahead, cross_check), soil.carried_l), []
 
     def _seen(self, soil: HeightMap, stance: Stance) -> list[PictureFault]:
         return self._health.misplaced(soil, stance) or obstructed(soil)
@@ -228,12 +242,13 @@ class SoilClassifier:
     def _observation(
         self,
         frame: Frame,
-        verdict: Verdict,
+        judged: _Judged,
         angle_deg: float,
         angle_age_s: float,
         faults: list[PictureFault],
         start_s: float,
     ) -> SoilObservation:
+        verdict, ahead = judged.verdict, judged.ahead
         volumes = verdict.volumes_l
         return SoilObservation(
             capture_s=frame.capture_s,
@@ -252,7 +267,17 @@ class SoilClassifier:
             method=self._settings.method,
             cpu_ms=(time.thread_time() - start_s) * 1000.0,
             faults=tuple(faults),
+            ahead=SoilAhead(
+                ahead.zone, float(np.clip(ahead.confidence, 0.0, 1.0)), ahead.reason, _thirds(ahead.volumes_l)
+            )
+            if ahead
+            else None,
+            carried=_thirds(judged.carried_l) if judged.carried_l else None,
         )
+
+
+def _thirds(amounts: tuple[float, float, float] | None) -> Thirds:
+    return Thirds(amounts[LEFT], amounts[CENTER], amounts[RIGHT]) if amounts else Thirds()
 
 
 def make_classifier(

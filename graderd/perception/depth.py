@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from graderd.core.blade import BladeGeometry
+from graderd.core.blade import STEEPEST_MEETING_DEG, BladeGeometry
 from graderd.core.soil import Zone
 from graderd.hal.camera import DepthImage
 from graderd.perception.decide import Verdict, decide
@@ -35,14 +35,19 @@ from graderd.perception.geometry import F32, F64, U8, View, third_outlines_px
 from graderd.perception.ground import Ground, GroundFit
 from graderd.perception.registration import BladeFinder, BladeFix, Stance, UpperEdge
 from graderd.perception.settings import DecisionSettings, DepthSettings
+from graderd.perception.split import Cells, split_soil
 
 I64 = npt.NDArray[np.intp]
 Litres = tuple[float, float, float]
+NOTHING: Litres = (0.0, 0.0, 0.0)
 
 NOMINAL_WIDTH_PX = 848
 KEPT_GRIDS_N = 64
 CONTEXT_M = 0.14
 """The height map goes on so far beyond the reach: what stands at its border is judged by what stands before it."""
+BESIDE_RATIO = 0.87
+"""And beyond both ends of the blade by this part of the travel looked ahead: the sine of 60 degrees, as far as a blade
+turns; one turned further looks less far ahead at its leading end."""
 STANDING_REACH_M = 0.60
 """So far ahead of the face what stands is looked for: a person a step before the soil's zone."""
 SUNK_M = 0.017
@@ -62,23 +67,29 @@ class HeightMap:
     """Soil in blade coordinates: ``height_m[i, j]`` at s cell i (right to left) and d cell j (blade to front).
 
     ``seen`` is False where the height was filled in. Triples are per third: right, center, left. ``valid``: share of
-    the pixels on it that measure it, neither without depth nor hidden by something nearer. ``doubtful_l``: what of
-    ``volumes_l`` lies beside something that is no soil. ``things_l``, ``weak_l``: what else rises there, and is no
-    soil or does not stand out of the uneven ground. ``standing_at_m``: s and d of something that stands upright.
-    ``cut_m``: how far the edge is under what looks like ground, where no lift says why. ``form_is_sure``: noise
-    does not drown what tells soil from things.
+    the pixels on it that measure it, neither without depth nor hidden by something nearer. ``volumes_l``: all soil
+    before each third to the reach; ``carried_l``, ``ahead_l``: see :func:`graderd.perception.split.split_soil`.
+    ``doubtful_l``, ``doubtful_ahead_l``: what of ``volumes_l`` and ``ahead_l`` lies beside something that is no soil.
+    ``things_l``, ``weak_l``: what else rises there, and is no soil or does not stand out of the uneven ground.
+    ``angle_deg``: where the blade was found. ``standing_at_m``: s and d of something that stands upright. ``cut_m``:
+    how far the edge is under what looks like ground, where no lift says why. ``form_is_sure``: noise does not drown
+    what tells soil from things.
     """
 
     height_m: F64
     seen: Bools
     threshold_m: float
     volumes_l: Litres
+    carried_l: Litres
+    ahead_l: Litres
     doubtful_l: Litres
+    doubtful_ahead_l: Litres
     things_l: Litres
     weak_l: Litres
-    valid: tuple[float, float, float]
+    valid: Litres
     ground: Ground
     blade: BladeFix
+    angle_deg: float
     edge: UpperEdge | None = None
     standing_at_m: tuple[float, float] | None = None
     cut_m: float = 0.0
@@ -108,9 +119,15 @@ class DepthJudge:
         self._cell_s_m = blade.length_m / self._along_n
         self._cell_d_m = blade.reach_m / self._ahead_n
         self._context_n = round(CONTEXT_M / self._cell_d_m)
-        half = blade.length_m / 2
-        self._cells_s_m = (np.arange(self._along_n)[:, None] + 0.5) * self._cell_s_m - half
-        self._cells_d_m = (np.arange(self._ahead_n + self._context_n)[None, :] + 0.5) * self._cell_d_m
+        self._travel_m = blade.reach_m + CONTEXT_M
+        self._beside_n = int(np.ceil(self._travel_m * BESIDE_RATIO / self._cell_s_m))
+        rows_n, columns_n = self._along_n + 2 * self._beside_n, self._ahead_n + self._context_n
+        self._cells = Cells(
+            self._cell_s_m * np.arange(0.5 - rows_n / 2, rows_n / 2, dtype=np.float64),
+            self._cell_d_m * np.arange(0.5, columns_n, dtype=np.float64),
+            self._cell_s_m * self._cell_d_m,
+        )
+        self._before = slice(self._beside_n, self._beside_n + self._along_n), slice(self._ahead_n)
 
     def height_map(self, depth_mm: DepthImage, stance: Stance) -> HeightMap:
         """Measure one depth picture (uint16, mm along the optical axis, 0 = no value)."""
@@ -121,7 +138,7 @@ class DepthJudge:
         ground, cut_m = self._layer(ground, edge, stance)
         s, d, z = self._in_blade(points, ground, angle_deg)
         # Some way behind and beside the blade too, where its face is looked for.
-        wide = np.float32(blade.length_m / 2 + BladeFinder.SEARCH_M)
+        wide = np.float32(blade.length_m / 2 + self._travel_m * BESIDE_RATIO)
         near = np.flatnonzero((np.abs(d - np.float32(0.22)) < np.float32(STANDING_REACH_M - 0.22)) & (np.abs(s) < wide))
         pixels, s, d, z, raw_z = pixels[near], s[near], d[near], z[near], points[2][near]
         above_edge = self._above_edge(s, z, raw_z, edge, stance)
@@ -140,7 +157,7 @@ class DepthJudge:
         wanted = np.flatnonzero(low & (d < blade.reach_m + CONTEXT_M))
         valid = self._valid_shares(pixels[wanted], angle_deg)
         in_front = wanted[(face[wanted] > np.float32(FACE_MARGIN_M)) & (d[wanted] > 0)]
-        soil = self._map(s[in_front], d[in_front], z[in_front], ground, fix, valid, self._noise_m(ground, angle_deg))
+        soil = self._map(s[in_front], d[in_front], z[in_front], ground, fix, valid, angle_deg)
         return replace(soil, edge=edge, standing_at_m=stands, cut_m=cut_m)
 
     def _layer(self, ground: Ground, edge: UpperEdge | None, stance: Stance) -> tuple[Ground, float]:
@@ -171,8 +188,21 @@ class DepthJudge:
 
     def verdict(self, soil: HeightMap) -> Verdict:
         """Judge a height map."""
+        return self._believed(soil, soil.volumes_l, soil.doubtful_l)
+
+    def verdict_ahead(self, soil: HeightMap) -> Verdict:
+        """Judge what the blade will meet."""
+        verdict = self._believed(soil, soil.ahead_l, soil.doubtful_ahead_l)
+        ahead_l, carried_l = sum(soil.ahead_l), sum(soil.carried_l)
+        if verdict.zone is not Zone.NONE and ahead_l * 100 < self._settings.ahead_min_percent * carried_l:
+            return verdict.unknown(f"{ahead_l:.1f} l ahead do not stand out of the {carried_l:.1f} l that are carried")
+        if abs(soil.angle_deg) > STEEPEST_MEETING_DEG:
+            return verdict.unknown(f"the blade is turned by {soil.angle_deg:.0f} degrees: it meets hardly anything")
+        return verdict
+
+    def _believed(self, soil: HeightMap, amounts_l: Litres, doubtful_l: Litres) -> Verdict:
         settings = self._settings
-        verdict = decide(soil.volumes_l, settings.none_volume_l, "l", self._decision, soil.volumes_l)
+        verdict = decide(amounts_l, settings.none_volume_l, "l", self._decision, amounts_l)
         weakest = min(soil.valid)
         if weakest * 100 < settings.min_valid_percent:
             return verdict.unknown(
@@ -191,10 +221,8 @@ class DepthJudge:
             return verdict.unknown(
                 f"{things_l:.1f} l lie there whose form is not soil's, or hidden by noise, dust or drops"
             )
-        if any(soil.doubtful_l):
-            sure_l = np.subtract(soil.volumes_l, soil.doubtful_l)
-            right, center, left = (max(float(value), 0.0) for value in sure_l)
-            without = decide((right, center, left), settings.none_volume_l, "l", self._decision)
+        if any(doubtful_l):
+            without = decide(_less(amounts_l, doubtful_l), settings.none_volume_l, "l", self._decision)
             if without.zone is not verdict.zone:
                 return verdict.unknown(f"something that is no soil lies in it: without that {without.zone}")
         ground_l = UNEVEN_SHARE * soil.ground.residual_m * self._blade.length_m * self._blade.reach_m * 1000.0
@@ -252,20 +280,22 @@ class DepthJudge:
         angle = np.radians(angle_deg)
         x, y, z = self._view.position_m
         s, d = y * np.cos(angle) - x * np.sin(angle), x * np.cos(angle) + y * np.sin(angle) - self._blade.x_offset_m
-        square_m2 = (self._cells_s_m - s) ** 2 + (self._cells_d_m - d) ** 2 + z**2
+        square_m2 = (self._cells.s_m[:, None] - s) ** 2 + (self._cells.d_m[None, :] - d) ** 2 + z**2
         return np.asarray(ground.noise_m_per_m2 * square_m2, dtype=np.float64)
 
-    def _map(self, s: F32, d: F32, z: F32, ground: Ground, fix: BladeFix, valid: Litres, noise_m: F64) -> HeightMap:
-        blade, settings = self._blade, self._settings
-        half = np.float32(blade.length_m / 2)
+    def _map(self, s: F32, d: F32, z: F32, ground: Ground, fix: BladeFix, valid: Litres, angle_deg: float) -> HeightMap:
+        settings = self._settings
+        along_n = self._cells.s_m.size
+        half = np.float32(along_n * self._cell_s_m / 2)
+        noise_m = self._noise_m(ground, angle_deg)
         inside = np.flatnonzero(np.abs(s) < half)
         s, d, z = s[inside], d[inside], z[inside]
         ahead_n = self._ahead_n + self._context_n
-        i = np.minimum(((s + half) * np.float32(1 / self._cell_s_m)).astype(np.int32), self._along_n - 1)
+        i = np.minimum(((s + half) * np.float32(1 / self._cell_s_m)).astype(np.int32), along_n - 1)
         j = np.minimum((d * np.float32(1 / self._cell_d_m)).astype(np.int32), ahead_n - 1)
         flat = i * ahead_n + j
-        shape = (self._along_n, ahead_n)
-        size = self._along_n * ahead_n
+        shape = (along_n, ahead_n)
+        size = along_n * ahead_n
         count = np.bincount(flat, minlength=size)
         seen = count > 0
         n = np.maximum(count, 1)
@@ -285,26 +315,53 @@ class DepthJudge:
         filled = fill_hidden(height, good, float(slope[1]), float(slope[0]))
         threshold = max(settings.min_height_m, settings.noise_factor_ratio * ground.residual_m)
         forms = sort_out(height, filled, seen, steep, ground.residual_m, threshold, form)
-        taken = slice(0, self._ahead_n)
+        volumes_l, carried_l, ahead_l = self._split(filled, forms.soil, angle_deg + fix.turn_deg)
+        doubtful_l, doubtful_ahead_l = NOTHING, NOTHING
+        if forms.doubtful[self._before].any():
+            sure_l, _, sure_ahead_l = self._split(filled, forms.soil & ~forms.doubtful, angle_deg + fix.turn_deg)
+            doubtful_l, doubtful_ahead_l = _less(volumes_l, sure_l), _less(ahead_l, sure_ahead_l)
         return HeightMap(
-            filled[:, taken],
-            seen[:, taken],
+            filled[self._before],
+            seen[self._before],
             threshold,
-            self._litres(filled, forms.soil),
-            self._litres(filled, forms.doubtful),
-            self._litres(np.where(seen, height, filled), forms.things),
-            self._litres(filled, forms.weak),
+            volumes_l,
+            carried_l,
+            ahead_l,
+            doubtful_l,
+            doubtful_ahead_l,
+            self._litres(np.where(seen, height, filled), forms.things)[0],
+            self._litres(filled, forms.weak)[0],
             valid,
             ground,
             fix,
+            angle_deg + fix.turn_deg,
             form_is_sure=not bool((noise_m[forms.things] * SLOPE_NOISE_RATIO > form.steep_spread_m).any()),
         )
 
-    def _litres(self, height: F64, where: Bools) -> Litres:
-        """Litres per third of the map's cells ``where``, with what lies behind the first ones in the hollow face."""
+    def _split(self, height: F64, where: Bools, angle_deg: float) -> tuple[Litres, Litres, Litres]:
+        """Litres per third of the map's cells ``where``: all before the blade, carried by it, and ahead of it."""
+        soil = np.where(where, np.maximum(height, 0.0), 0.0)
+        meeting_deg = min(max(angle_deg, -STEEPEST_MEETING_DEG), STEEPEST_MEETING_DEG)
+        repose_deg = self._settings.repose_deg
+        carried_l, ahead_l = split_soil(soil, self._cells, meeting_deg, self._blade, repose_deg, self._travel_m)
+        all_l, hollow_l = self._litres(height, where)
+        return all_l, _plus(carried_l, hollow_l), ahead_l
+
+    def _litres(self, height: F64, where: Bools) -> tuple[Litres, Litres]:
+        """Litres per third of the map's cells ``where``; and what of it lies in the hollow of the face."""
         if not where.any():
-            return 0.0, 0.0, 0.0
-        ahead = np.where(where, height, 0.0)[:, : self._ahead_n]
-        along = ahead.sum(axis=1) * self._cell_d_m + self._finder.hollow_m2(ahead[:, 0])
-        right, center, left = (along.reshape(3, -1).sum(axis=1) * self._cell_s_m * 1000.0).tolist()
-        return max(right, 0.0), max(center, 0.0), max(left, 0.0)
+            return NOTHING, NOTHING
+        ahead = np.where(where, height, 0.0)[self._before]
+        hollow = self._finder.hollow_m2(ahead[:, 0])
+        both = np.stack((ahead.sum(axis=1) * self._cell_d_m + hollow, hollow))
+        thirds = np.maximum(both.reshape(2, 3, -1).sum(axis=2) * self._cell_s_m * 1000.0, 0.0).tolist()
+        (right, center, left), (behind_right, behind_center, behind_left) = thirds
+        return (right, center, left), (behind_right, behind_center, behind_left)
+
+
+def _plus(one: Litres, other: Litres) -> Litres:
+    return one[0] + other[0], one[1] + other[1], one[2] + other[2]
+
+
+def _less(one: Litres, other: Litres) -> Litres:
+    return max(one[0] - other[0], 0.0), max(one[1] - other[1], 0.0), max(one[2] - other[2], 0.0)

@@ -120,6 +120,11 @@ class DepthSettings(Settings):
     form: FormSettings = Field(default_factory=FormSettings)
     min_valid_percent: Percent = Field(default=35.0, description="less depth than this in front of the blade: unknown")
     none_volume_l: Positive = Field(default=1.2, description="less soil than this in front of the whole blade: none")
+    ahead_min_percent: Percent = Field(
+        default=20.0,
+        description="soil ahead of less than this part of what is carried may be the heap's own roughness or its foot: "
+        "unknown",
+    )
 
 
 class DecisionSettings(Settings):

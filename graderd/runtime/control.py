@@ -18,8 +18,9 @@ from graderd.core.tick import AxisSensed, AxisTick, Controller, Sensed, Tick, Ti
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceError
 from graderd.hal.fault import DeviceFault
+from graderd.hal.vehicle import VehicleTelemetry
 from graderd.runtime.devices import Devices, PowerSequencer
-from graderd.runtime.state_file import StateFile
+from graderd.runtime.state_file import LastStop, StateFile
 
 MAX_COMMANDS_PER_TICK = 32
 LATENESS_WINDOW_N = 500
@@ -58,7 +59,16 @@ def tick_settings(config: Config) -> TickSettings:
         presets=config.presets,
         overrun_s=config.control.overrun_s,
         max_frame_age_s=config.perception.decision.max_frame_age_s,
+        max_vehicle_age_s=config.vehicle.max_age_s,
     )
+
+
+def _state_at_start(last_stop: LastStop | None) -> State:
+    """Stopped, where nobody has let go of what stopped the machine before it was started anew."""
+    if last_stop is None or last_stop.reset:
+        return State()
+    reason = f"stopped before the daemon was started: {last_stop}"
+    return State(mode=Mode.STOPPED, reason=reason, stop_n=1, stops=(reason,))
 
 
 class ControlLoop:
@@ -80,7 +90,7 @@ class ControlLoop:
         self.fault_sources: list[Callable[[float], tuple[DeviceFault, ...]]] = []
         self.on_tick: Callable[[], None] | None = None
         self._period_s = 1.0 / config.control.tick_hz
-        self._controller = Controller(tick_settings(config))
+        self._controller = Controller(tick_settings(config), _state_at_start(self.last_stop))
         self._devices = devices
         self._eyes = eyes
         self._clock = clock
@@ -151,10 +161,18 @@ class ControlLoop:
         before = self.tick.state
         self.sensed = self._sense(commands, late_s)
         self.tick = self._controller.step(self.sensed)
-        if before.mode is not self.tick.state.mode:
-            self._tell_transition(before.mode, self.tick.state)
-        self._act(self.tick)
+        self._act(self.tick)  # the wires come first, then whoever wants to know
+        self._note(before.mode, self.tick.state)
         return self.tick.replies
+
+    def _note(self, before: Mode, after: State) -> None:
+        if before is after.mode:
+            return
+        if after.mode is Mode.STOPPED and not self._keep_last_stop:
+            self.last_stop = self._state_file.save(after.reason)
+        elif before is Mode.STOPPED and self.last_stop is not None:
+            self.last_stop = self._state_file.save_reset(self.last_stop)
+        self._tell_transition(before, after)
 
     def _tell_transition(self, before: Mode, after: State) -> None:
         """Who or what changed the mode stands in fields of its own beside the text."""
@@ -187,14 +205,13 @@ class ControlLoop:
             arm_error=self._power.take_error(),
             refused=refused,
             late_s=late_s,
+            vehicle=self._devices.vehicle.telemetry() if self._devices.vehicle else VehicleTelemetry(),
         )
 
     def _act(self, tick: Tick) -> None:
         """Hand what was decided to the devices."""
         if tick.stopped_now:
             self._hold_all()
-            if not self._keep_last_stop:
-                self.last_stop = self._state_file.save(tick.state.reason)
         self._power.want(tick.intents.power)
         for axis, decided in tick.axes.items():
             self._tell(axis, decided)

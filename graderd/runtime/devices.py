@@ -16,7 +16,8 @@ from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.rotator import Rotator
-from graderd.hal.service import DeviceService
+from graderd.hal.service import DeviceService, WatchBus
+from graderd.hal.vehicle import Vehicle
 
 RETRY_S = 1.0
 
@@ -47,14 +48,9 @@ def _publish_nowhere(faults: tuple[DeviceFault, ...], stopped: bool) -> None:
     """Where there is no bus to tell."""
 
 
-def _watch_nothing(listener: Callable[[str], None]) -> Callable[[], None]:  # noqa: ARG001
-    """Where there is no bus to watch."""
-    return lambda: None
-
-
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """Everything that can move, and the bus under it."""
+    """Everything that can move, the bus under it, and the vehicle that carries it."""
 
     rotation: Rotator
     link: Link
@@ -63,9 +59,9 @@ class Devices:
     """What the drivers offer besides, as ``device.name``; what a driver has not is absent."""
     publish_faults: Callable[[tuple[DeviceFault, ...], bool], None] = _publish_nowhere
     """Puts the active faults, and whether the machine is stopped, on the bus as diagnostic messages (DM1)."""
-    watch_bus: Callable[[Callable[[str], None]], Callable[[], None]] = _watch_nothing
-    """Calls a listener with every frame on the bus, received or sent, as a line of candump text; returns the call
-    that ends it."""
+    buses: Mapping[str, WatchBus] = field(default_factory=dict)
+    """The wires that can be watched: ``can``, and what the rotation's driver has of its own."""
+    vehicle: Vehicle | None = None
     problems: dict[str, str] = field(default_factory=dict)
     """Why a device, or the bus (``can``), is not open yet; kept by :func:`open_devices`."""
 
@@ -164,6 +160,8 @@ async def open_devices(devices: Devices) -> None:
     async with asyncio.TaskGroup() as group:
         group.create_task(_keep_trying("rotation", devices.rotation.open, devices.problems), name="open-rotation")
         group.create_task(_open_bus(devices), name="open-can")
+        if devices.vehicle is not None:
+            group.create_task(devices.vehicle.open(), name="open-vehicle")
 
 
 async def _open_bus(devices: Devices) -> None:

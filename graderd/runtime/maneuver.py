@@ -34,7 +34,15 @@ class Maneuver:
         Raises:
             DeviceRefusedError: not ready, or arming failed; the message says why.
         """
-        await self._obey(cmd.Arm(client=CLIENT))
+        try:
+            await self._obey(cmd.Arm(client=CLIENT))
+            await self._armed()
+        except asyncio.CancelledError:  # the client that asked is gone: nobody else would disarm what it armed
+            await self._loop.command(cmd.Disarm(client=CLIENT))
+            raise
+        return self
+
+    async def _armed(self) -> None:
         try:
             async with asyncio.timeout(ARM_TIMEOUT_S):
                 while (state := self._loop.tick.state).mode is not Mode.MANUAL:
@@ -43,7 +51,6 @@ class Maneuver:
                     await asyncio.sleep(SAMPLE_S)
         except TimeoutError:
             raise DeviceRefusedError("arm", f"not armed within {ARM_TIMEOUT_S:g} s") from None
-        return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

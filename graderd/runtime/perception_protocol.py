@@ -110,6 +110,8 @@ class Observed(_Message):
         shares = (observation.share_left, observation.share_center, observation.share_right)
         if not 0.0 <= observation.confidence <= 1.0 or not all(0.0 <= share <= 1.0 for share in shares):
             raise ValueError(f"confidence {observation.confidence} or shares {shares} are not between 0 and 1")
+        if observation.ahead is not None and not 0.0 <= observation.ahead.confidence <= 1.0:
+            raise ValueError(f"confidence {observation.ahead.confidence} of the soil ahead is not between 0 and 1")
         if not math.isfinite(observation.capture_s):
             raise ValueError(f"capture_s is {observation.capture_s}")
         return observation

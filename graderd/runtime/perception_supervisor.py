@@ -230,10 +230,12 @@ class PerceptionSupervisor:
             )
         )
         try:
-            await asyncio.shield(starting)
-        finally:
+            self._process = await asyncio.shield(starting)
+        except asyncio.CancelledError:
             # Cancelled half-way, the child would be left running: wait for it, run() kills it on the way out.
-            self._process = await starting
+            with contextlib.suppress(OSError):
+                self._process = await starting
+            raise
         assert self._process.stdin is not None  # asked for above
         assert self._process.stdout is not None
         start = self._start.model_copy(update={"reset_first": reset_first})

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Mapping
 from typing import Any
+
+from pydantic import ValidationError
 
 from graderd.api.port import ServiceError
 from graderd.config import Config
@@ -13,7 +15,7 @@ from graderd.core.commands import Command, Reply, Stop
 from graderd.core.machine import Mode
 from graderd.core.status import Status
 from graderd.hal.errors import DeviceError
-from graderd.hal.service import DeviceService
+from graderd.hal.service import DeviceService, WatchBus
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
@@ -43,6 +45,7 @@ class Port:
         self._eyes = eyes
         self._waiting: list[asyncio.Future[Status]] = []
         self._cached: Status | None = None
+        self._under_way = ""
 
     def published(self) -> None:
         """Called after each tick: hand the new status to those who wait."""
@@ -69,10 +72,13 @@ class Port:
         return await future
 
     async def command(self, command: Command) -> Reply:
-        """Hand a command to the next tick; stop acts at once."""
-        reply = await self._loop.command(command)
-        if isinstance(command, Stop):
-            self._cached = None  # it acted between two ticks: who asks now sees the machine stopped
+        """Hand a command to the next tick."""
+        return await self._loop.command(command)
+
+    def stop(self, command: Stop) -> Reply:
+        """Every wire is told now, between two ticks: who asks afterwards sees the machine stopped."""
+        reply = self._loop.stop_now(command)
+        self._cached = None
         return reply
 
     def config(self) -> dict[str, Any]:
@@ -86,8 +92,15 @@ class Port:
         except TimeoutError:
             raise ServiceError("the camera gives no picture", "see graderd status for its fault") from None
 
-    async def bus_text(self) -> AsyncGenerator[str, None]:
-        """What is on the CAN bus from now on; a reader that is slow loses the oldest lines and is told how many."""
+    def bus_text(self, name: str) -> AsyncGenerator[str, None]:
+        """What is on a wire from now on; a reader that is slow loses the oldest lines and is told how many."""
+        watch = self._devices.buses.get(name)
+        if watch is None:
+            known = ", ".join(sorted(self._devices.buses))
+            raise ServiceError(f"there is no bus '{name}'", f"there are: {known}")
+        return self._bus_text(watch)
+
+    async def _bus_text(self, watch: WatchBus) -> AsyncGenerator[str, None]:
         lines: deque[str] = deque(maxlen=BUS_LINES_N)
         arrived, heard_n = asyncio.Event(), 0
 
@@ -97,7 +110,7 @@ class Port:
             lines.append(line)
             arrived.set()
 
-        end = self._devices.watch_bus(hear)
+        end = watch(hear)
         try:
             while True:
                 await arrived.wait()
@@ -106,26 +119,54 @@ class Port:
                 text = "".join(f"{line}\n" for line in lines)
                 lines.clear()
                 arrived.clear()
-                yield f"# {lost_n} frames lost: the reader is too slow\n{text}" if lost_n else text
+                yield f"# {lost_n} lines lost: the reader is too slow\n{text}" if lost_n else text
         finally:
             end()
 
+    def services(self) -> Mapping[str, DeviceService]:
+        """The services there are, by name."""
+        return self._services
+
     async def service(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
-        """Run a device service; those that move or unpower need manual or disarmed mode and consent."""
+        """Run a device service; those that move or unpower need a disarmed machine, consent, and no other under way.
+        Cancelled, one that moves ends and the blade holds; another is waited for, which may not be left half done."""
         service = self._services.get(name)
         if service is None:
             known = ", ".join(sorted(self._services))
             raise ServiceError(f"there is no service '{name}'", f"there are: {known}")
-        arguments = dict(arguments)
-        consent = bool(arguments.pop("consent", False))
-        if not service.only_reads:
-            if not consent:
-                raise ServiceError(
-                    f"{name} may move or unpower the blade", "repeat with consent when the area is clear"
-                )
-            if (mode := self._loop.tick.state.mode) is not Mode.DISARMED:
-                raise ServiceError(f"{name} needs a disarmed machine; it is {mode}", "disarm first")
+        given = {key: value for key, value in arguments.items() if key != "consent"}
         try:
-            return await service.run(arguments)
-        except DeviceError as error:
-            raise ServiceError(f"{error.where}: {error.cause}", error.remedy) from error
+            wanted = service.arguments.model_validate(given)
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise ServiceError(f"{'.'.join(map(str, first['loc'])) or 'arguments'}: {first['msg']}") from None
+        if service.only_reads:
+            return await _answer_of(service.run(wanted))
+        if arguments.get("consent") is not True:
+            raise ServiceError(f"{name} may move or unpower the blade", "repeat with consent when the area is clear")
+        if self._under_way:
+            raise ServiceError(f"{self._under_way} is under way", "wait until it is done, or send stop")
+        if (mode := self._loop.tick.state.mode) is not Mode.DISARMED:
+            raise ServiceError(f"{name} needs a disarmed machine; it is {mode}", "disarm first")
+        self._under_way = name
+        try:
+            return await _answer_of(service.run(wanted) if service.moves else _to_the_end(service.run(wanted)))
+        finally:
+            self._under_way = ""
+
+
+async def _answer_of(work: Awaitable[dict[str, Any]]) -> dict[str, Any]:
+    try:
+        return await work
+    except DeviceError as error:
+        raise ServiceError(f"{error.where}: {error.cause}", error.remedy) from error
+
+
+async def _to_the_end(work: Awaitable[dict[str, Any]]) -> dict[str, Any]:
+    """Like ``work``; a first cancellation waits for its end."""
+    task = asyncio.ensure_future(work)
+    try:
+        return await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await asyncio.gather(task, return_exceptions=True)
+        raise

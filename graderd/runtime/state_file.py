@@ -1,22 +1,30 @@
-"""The little that survives a restart: why the machine stopped last. Written atomically, checked when read."""
+"""The little that survives a restart: why the machine stopped last, and whether somebody has reset that stop.
+
+Written atomically, checked when read. A thread writes: a disk that stalls must hold up neither a stop nor a tick.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import threading
 from datetime import UTC, datetime
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+WRITE_MOST_S = 1.0
+"""At its end the daemon waits so long for the last write."""
+
 
 class LastStop(BaseModel):
-    """The newest latched stop."""
+    """The newest latched stop. ``reset``: a person has let go of it."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     reason: str
     wall_time: str
+    reset: bool = False
 
     def __str__(self) -> str:
         return f"{self.reason} ({self.wall_time})"
@@ -30,6 +38,9 @@ class StateFile:
         self._path = Path(directory) / "last_stop.json" if directory else None
         self.problem = ""
         """Why the file could not be read or written; empty if all is well."""
+        self._to_write: LastStop | None = None
+        self._writing = False
+        self._changed = threading.Condition()
 
     def load(self) -> LastStop | None:
         """The last stop, or None. A damaged file is kept aside under ``.damaged`` and told in :attr:`problem`."""
@@ -46,15 +57,53 @@ class StateFile:
             return None
 
     def save(self, reason: str) -> LastStop:
-        """Write the reason of a stop; a full disk is told in :attr:`problem`, never raised into the control loop."""
+        """Have the reason of a stop written; a disk that is full or stalls is told in :attr:`problem`, never waited
+        for and never raised into the control loop."""
         stop = LastStop(reason=reason, wall_time=datetime.now(UTC).isoformat(timespec="seconds"))
-        if self._path is not None:
-            temporary = self._path.with_suffix(".new")
+        self._write_soon(stop)
+        return stop
+
+    def save_reset(self, stop: LastStop) -> LastStop:
+        """Have it written that a person has let go of this stop."""
+        stop = stop.model_copy(update={"reset": True})
+        self._write_soon(stop)
+        return stop
+
+    def settle(self, most_s: float = WRITE_MOST_S) -> bool:
+        """Wait until everything is written, not longer than ``most_s``, and say whether it is."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._writing, most_s)
+
+    def _write_soon(self, stop: LastStop) -> None:
+        if self._path is None:
+            return
+        with self._changed:
+            self._to_write = stop
+            if self._writing:
+                self.problem = self.problem or f"{self._path}: the disk takes long to write"
+                return
+            self._writing = True
+        # Not one of a pool: a pool waits for its threads at the end of the process.
+        try:
+            threading.Thread(target=self._write_all, args=(self._path,), name="state-file", daemon=True).start()
+        except RuntimeError as error:  # no more threads
+            self._writing = False
+            self.problem = f"{self._path}: {error}"
+
+    def _write_all(self, path: Path) -> None:
+        """Write the newest until there is nothing newer."""
+        while True:
+            with self._changed:
+                stop, self._to_write = self._to_write, None
+                if stop is None:
+                    self._writing = False
+                    self._changed.notify_all()
+                    return
+            temporary = path.with_suffix(".new")
             try:
-                self._path.parent.mkdir(parents=True, exist_ok=True)
+                path.parent.mkdir(parents=True, exist_ok=True)
                 temporary.write_text(json.dumps(stop.model_dump()), encoding="utf-8")
-                temporary.replace(self._path)
+                temporary.replace(path)
                 self.problem = ""
             except OSError as error:
-                self.problem = f"{self._path}: {error.strerror}"
-        return stop
+                self.problem = f"{path}: {error.strerror}"

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from importlib.metadata import version
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from graderd.config import Config
 from graderd.core.axes import UNITS
-from graderd.core.soil import SoilObservation
+from graderd.core.soil import SoilAhead, SoilObservation, Thirds
 from graderd.core.status import (
+    AheadStatus,
     AttitudeStatus,
     AxisStatus,
     DecisionStatus,
@@ -18,17 +19,23 @@ from graderd.core.status import (
     RequirementStatus,
     SoilStatus,
     Status,
+    ThirdsStatus,
     TickStatus,
+    VehicleStatus,
 )
 from graderd.core.tick import AxisSensed, AxisTick
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry
+from graderd.hal.vehicle import VehicleTelemetry
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 
 T = TypeVar("T")
+VEHICLE_MAX_AGE_S = 1.0
+"""How the machine drives is unknown when nobody has told it for so long."""
 VERSION = version("graderd")
+KNOWN_FOR_S = 5.0
 
 
 def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) -> Status:
@@ -36,6 +43,7 @@ def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) 
     tick, sensed = loop.tick, loop.sensed
     now_s, state, decision = tick.now_s, tick.state, tick.state.decision
     lateness = sorted(loop.lateness_s)
+    figures = config.figures()
     return Status(
         time_s=now_s,
         wall_time=datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -52,9 +60,15 @@ def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) 
             zone=decision.zone,
             angle_deg=decision.angle_deg,
             age_s=now_s - decision.decided_s if decision.zone is not None else None,
-            reason=decision.reason,
+            kept=decision.kept,
+            since_m=decision.since_m,
+            reason=decision.reason(now_s),
         ),
-        axes={name: _axis(name, told, tick.axes[name], now_s) for name, told in sensed.axes.items()},
+        vehicle=_vehicle(sensed.vehicle, now_s),
+        axes={
+            name: _axis(name, told, tick.axes[name], now_s, figures[name].max_age_s)
+            for name, told in sensed.axes.items()
+        },
         attitude=AttitudeStatus(
             height_mm=tick.attitude.height_mm, slope_deg=tick.attitude.slope_deg, pitch_deg=tick.attitude.pitch_deg
         ),
@@ -102,6 +116,8 @@ def _soil(newest: SoilObservation | None, frames_per_s: float, now_s: float) -> 
         volume_left_l=newest.volume_left_l,
         volume_center_l=newest.volume_center_l,
         volume_right_l=newest.volume_right_l,
+        ahead=newest.ahead and _ahead(newest.ahead),
+        carried=newest.carried and ThirdsStatus(**_litres(newest.carried)),
         blade_angle_deg=newest.blade_angle_deg,
         frame_number_n=newest.frame_number,
         frames_per_s=frames_per_s,
@@ -109,8 +125,37 @@ def _soil(newest: SoilObservation | None, frames_per_s: float, now_s: float) -> 
     )
 
 
-def _axis(name: str, axis: AxisSensed, decided: AxisTick, now_s: float) -> AxisStatus:
+def _ahead(ahead: SoilAhead) -> AheadStatus:
+    return AheadStatus(zone=ahead.zone, confidence=ahead.confidence, reason=ahead.reason, **_litres(ahead.litres))
+
+
+def _litres(thirds: Thirds) -> dict[str, float]:
+    return {"left_l": thirds.left, "center_l": thirds.center, "right_l": thirds.right}
+
+
+def _vehicle(told: VehicleTelemetry, now_s: float) -> VehicleStatus:
+    return VehicleStatus(
+        speed_m_per_s=_moving(told.speed_m_per_s, now_s),
+        travelled_m=_moving(told.travelled_m, now_s),
+        age_s=told.speed_m_per_s.age_s(now_s) if told.speed_m_per_s else None,
+    )
+
+
+def _moving(reading: Reading[float] | None, now_s: float) -> float | None:
+    return reading.value if reading is not None and reading.is_fresh(now_s, VEHICLE_MAX_AGE_S) else None
+
+
+def _axis(name: str, axis: AxisSensed, decided: AxisTick, now_s: float, max_age_s: float) -> AxisStatus:
     told = axis.telemetry
+
+    def fresh(reading: Reading[T] | None) -> T | None:
+        """What control may act on, and nothing older: past its age it is unknown."""
+        return reading.value if reading is not None and reading.is_fresh(now_s, max_age_s) else None
+
+    def known(reading: Reading[T] | None) -> T | None:
+        """What changes slowly and is asked for seldom."""
+        return reading.value if reading is not None and reading.is_fresh(now_s, KNOWN_FOR_S) else None
+
     return AxisStatus(
         name=name,
         unit=UNITS[name],
@@ -119,37 +164,41 @@ def _axis(name: str, axis: AxisSensed, decided: AxisTick, now_s: float) -> AxisS
         limited=decided.limited,
         limited_because=decided.because,
         arrived=decided.arrived,
-        measured=_value(told.position),
+        measured=fresh(told.position),
         measured_age_s=told.position.age_s(now_s) if told.position else None,
-        current_a=_value(told.current_a),
-        moving=_value(told.moving),
+        current_a=fresh(told.current_a),
+        moving=fresh(told.moving),
         counters=told.counters,
-        **(_rotator(told) if isinstance(told, RotatorTelemetry) else _actuator(told)),
+        **(_rotator(told, fresh, known) if isinstance(told, RotatorTelemetry) else _actuator(told, fresh, known)),
     )
 
 
-def _rotator(told: RotatorTelemetry) -> dict[str, Any]:
+class _Known(Protocol):
+    def __call__(self, reading: Reading[T] | None) -> T | None: ...
+
+
+def _rotator(told: RotatorTelemetry, fresh: _Known, known: _Known) -> dict[str, Any]:
     return {
-        "sent": _value(told.goal_sent_deg),
-        "velocity_per_s": _value(told.velocity_deg_per_s),
-        "torque_nm": _value(told.torque_nm),
-        "voltage_v": _value(told.voltage_v),
-        "temperature_c": _value(told.temperature_c),
-        "in_position": _value(told.in_position),
-        "torque_on": _value(told.torque_on),
+        "sent": _sent(told.goal_sent_deg),
+        "velocity_per_s": fresh(told.velocity_deg_per_s),
+        "torque_nm": fresh(told.torque_nm),
+        "voltage_v": known(told.voltage_v),
+        "temperature_c": known(told.temperature_c),
+        "in_position": fresh(told.in_position),
+        "torque_on": known(told.torque_on),
     }
 
 
-def _actuator(told: ActuatorTelemetry) -> dict[str, Any]:
+def _actuator(told: ActuatorTelemetry, fresh: _Known, known: _Known) -> dict[str, Any]:
     return {
-        "sent": _value(told.target_sent_mm),
-        "velocity_per_s": _value(told.velocity_mm_per_s),
-        "duty_percent": _value(told.duty_percent),
+        "sent": _sent(told.target_sent_mm),
+        "velocity_per_s": fresh(told.velocity_mm_per_s),
+        "duty_percent": fresh(told.duty_percent),
         "thermal_load": told.thermal_load,
-        "flags": tuple(sorted(told.flags.value)) if told.flags else (),
+        "flags": tuple(sorted(known(told.flags) or ())),
     }
 
 
-def _value(reading: Reading[T] | None) -> T | None:
-    """For show only, beside its age; control uses readings with a maximum age."""
+def _sent(reading: Reading[float] | None) -> float | None:
+    """What its driver was told last stays so, however long ago."""
     return reading.value if reading is not None and reading.valid else None

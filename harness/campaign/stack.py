@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from graderd.client import AsyncClient, ClientError, RefusedError
+from graderd.client import AsyncClient, ClientError, LeaseLostError, RefusedError
 from graderd.hal.errors import DeviceError
 from graderd.simulator.control_client import RigControl
 from harness.campaign.watch import Watch
@@ -238,20 +238,30 @@ class Stack:
     async def move(self, name: str, /, **fields: Any) -> None:
         """Begin a jog or preset and keep its lease until :meth:`rest`."""
         await self.rest()
-        answer = await self.command(name, **fields)
-        if not answer["accepted"]:
-            raise CampaignError(f"{name} {fields} was refused: {answer}")
-        self._mover = asyncio.create_task(self._keep(name, fields), name="campaign-lease")
+        begun: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._mover = asyncio.create_task(self._keep(name, fields, begun), name="campaign-lease")
+        if refusal := await begun:
+            raise CampaignError(f"{name} {fields} was refused: {refusal}")
 
-    async def _keep(self, name: str, fields: JsonObject) -> None:
+    async def _keep(self, name: str, fields: JsonObject, begun: asyncio.Future[str]) -> None:
         """Renew; a client that came late (a loaded machine) begins anew, one that is refused ends."""
         while True:
-            await asyncio.sleep(RENEW_S)
-            if not (await self.command("renew"))["accepted"] and not (await self.command(name, **fields))["accepted"]:
-                return
+            try:
+                async with self.client.lease() as lease:
+                    await (lease.jog if name == "jog" else lease.preset)(**fields)
+                    if not begun.done():
+                        begun.set_result("")
+                    while True:
+                        await asyncio.sleep(RENEW_S)
+                        await lease.renew()
+            except ClientError as error:
+                if not begun.done():
+                    begun.set_result(str(error))
+                if not isinstance(error, LeaseLostError):
+                    return
 
     async def rest(self) -> None:
-        """Stop renewing; the lease lapses by itself."""
+        """Give the lease back, if it is still held."""
         mover, self._mover = self._mover, None
         if mover is not None:
             mover.cancel()

@@ -10,8 +10,7 @@ import signal
 import sys
 from pathlib import Path
 
-import can
-
+from graderd.drivers.j1939.python_can import can
 from graderd.hal.errors import DeviceError, DeviceMissingError
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 

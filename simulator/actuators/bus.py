@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Literal
 
-import can
-
 from graderd.drivers.j1939.bus_health import ERROR_FRAMES, BusEvent
 from graderd.drivers.j1939.ids import Frame
+from graderd.drivers.j1939.python_can import can
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import DeviceMissingError
 from graderd.simulator.actuators import faults

@@ -9,9 +9,8 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-import can
-
 from graderd.drivers.j1939.ids import Frame
+from graderd.drivers.j1939.python_can import can
 
 _QUEUE_N: Final = 2000
 

@@ -8,11 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import can
-
 from graderd.drivers.dynamixel.codec import Instruction, Packet
 from graderd.drivers.electrak.codec import ElectrakCodec
 from graderd.drivers.j1939.ids import Frame, Pgn, destination_of, pgn_of
+from graderd.drivers.j1939.python_can import can
 from graderd.hal.clock import Clock, SystemClock
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from graderd.simulator.grader.blade import GROUND_LIFT_MM, LEVEL_TILT_MM, BladePose

@@ -16,12 +16,6 @@ PILE_OFFSET_M = 0.45
 LAYER_HEIGHT_M = 0.04
 LAYER_HALF_WIDTH_M = 0.70
 LAYER_BEHIND_M, LAYER_AHEAD_M = 0.9, 4.5
-BARE_STRIP_M = (0.36, 0.70)
-WINDROW_HEIGHT_M = 0.12
-WINDROW_X_M, WINDROW_Y_M = (-0.50, 0.35), (0.50, 0.80)
-"""A bare strip across the layer, beyond the blade's reach, and a windrow beside its left end: with them a standing
-blade that turns from 0 to +45 degrees keeps the soil before it even. Its left end leaves the layer behind and takes in
-the windrow's foot instead; its right end, which gathers what it sweeps, finds the strip bare."""
 TOE_M = -0.10
 """Where a heap's near foot lies ahead of the face of a blade at angle 0; negative: the heap leans on the blade."""
 
@@ -68,7 +62,8 @@ def lay_scene(field: SoilField, zone: SceneZone, x_m: float, pose: BladePose, se
     if zone is SceneZone.NONE:
         return
     if zone is SceneZone.EVEN:
-        field.add(_even(field, x_m, seed))
+        ends_m = x_m - LAYER_BEHIND_M, x_m + LAYER_AHEAD_M
+        field.add(layer(field, *ends_m, LAYER_HALF_WIDTH_M, LAYER_HEIGHT_M, seed))
         return
     y_m = {SceneZone.LEFT: PILE_OFFSET_M, SceneZone.CENTER: 0.0, SceneZone.RIGHT: -PILE_OFFSET_M}[zone]
     field.add(heap(field, field.length_m / 2.0, y_m, PILE_LENGTH_M, PILE_WIDTH_M, PILE_HEIGHT_M, seed))
@@ -76,15 +71,6 @@ def lay_scene(field: SoilField, zone: SceneZone, x_m: float, pose: BladePose, se
     _shift_along(field, round((x_m + TOE_M - foot_m) / field.cell_m))
     s_m, d_m = blade_grid(field, field.whole, x_m, pose.angle_deg)
     field.heights_m[(d_m < 0.02) & (np.abs(s_m) < LENGTH_M / 2.0 + 0.3)] = 0.0
-
-
-def _even(field: SoilField, x_m: float, seed: int) -> FloatArray:
-    along, across = field.x_m[:, None] - x_m, field.y_m[None, :]
-    poured = layer(field, x_m - LAYER_BEHIND_M, x_m + LAYER_AHEAD_M, LAYER_HALF_WIDTH_M, LAYER_HEIGHT_M, seed)
-    bare = (along > BARE_STRIP_M[0]) & (along < BARE_STRIP_M[1]) & (across < LAYER_HALF_WIDTH_M)
-    windrow = (along > WINDROW_X_M[0]) & (along < WINDROW_X_M[1])
-    windrow = windrow & (across > WINDROW_Y_M[0]) & (across < WINDROW_Y_M[1])
-    return np.asarray(np.where(bare, 0.0, poured) + np.where(windrow, WINDROW_HEIGHT_M, 0.0))
 
 
 def _shift_along(field: SoilField, cells: int) -> None:

@@ -20,10 +20,12 @@ _BRAKE_M_PER_S2 = 4.0
 
 @dataclass
 class Vehicle:
-    """The machine's travel along the bed. ``x_m``: bed x of the blade's axis."""
+    """The machine's travel along the bed. ``x_m``: bed x of the blade's axis. ``travelled_m``: what its wheels have
+    rolled, backwards counted off; lifting it back to the start turns no wheel."""
 
     x_m: float = START_X_M
     speed_m_per_s: float = 0.0
+    travelled_m: float = 0.0
     _wanted_m_per_s: float = 0.0
     _stop_x_m: float = START_X_M
 
@@ -70,7 +72,8 @@ class Vehicle:
             move_m = min(move_m, max(self._stop_x_m - self.x_m, 0.0))
         elif self._wanted_m_per_s < 0.0:
             move_m = max(move_m, min(self._stop_x_m - self.x_m, 0.0))
-        self.x_m = min(max(self.x_m + move_m, MIN_X_M), MAX_X_M)
+        before_m, self.x_m = self.x_m, min(max(self.x_m + move_m, MIN_X_M), MAX_X_M)
+        self.travelled_m += self.x_m - before_m
         if self.x_m in (MIN_X_M, MAX_X_M) and self._wanted_m_per_s == 0.0:
             self.speed_m_per_s = 0.0
 

@@ -56,6 +56,9 @@ class ServoBody:
         self.tripped = False
         self.forced_voltage_v: float | None = None
         self.forced_temperature_c: float | None = None
+        self.refused: dict[int, int] = {}
+        self.misread_deg, self.misread_n = 0.0, 0
+        self.keeps_turns = False
         self._pulses_per_turn = int(self.table.profile["motion"]["pulses_per_turn"])
         self._deg_per_count = 360.0 / self._pulses_per_turn
         self._turn_base_deg = 0.0
@@ -312,7 +315,7 @@ class ServoBody:
 
     def _torque(self, on: bool) -> None:
         if on and not self.torque_enabled:
-            if self.memory["operating_mode"] == POSITION_MODE:
+            if self.memory["operating_mode"] == POSITION_MODE and not self.keeps_turns:
                 self._wrap()
             self.plant.relax()
             self.trajectory.restart(self.plant.motor_deg)

@@ -185,7 +185,9 @@ class VirtualServoBus:
         self._advance()
         servo = self.servos[0]
         faults, self._faults = self._faults, {}
-        servo.plant.jammed = servo.plant.reversed_loop = False
+        servo.plant.jammed = servo.plant.reversed_loop = servo.keeps_turns = False
+        servo.refused = {}
+        servo.misread_n = 0
         servo.forced_voltage_v = servo.forced_temperature_c = None
         if "push" in faults:
             servo.load_torque_nm = 0.0
@@ -208,6 +210,9 @@ class VirtualServoBus:
             servo.power(False)
             servo.power(True)
 
+        def misread(p: dict[str, float]) -> None:
+            servo.misread_deg, servo.misread_n = p["deg"], int(p["reads_n"])
+
         def alert(bit: int) -> Callable[[dict[str, float]], None]:
             return lambda _: servo.raise_hardware_error(bit)
 
@@ -215,6 +220,9 @@ class VirtualServoBus:
             "unplug": lambda _: self._pull_out(),
             "power_cut": power_cut,
             "ram_reset": ram_reset,
+            "refuse": lambda p: servo.refused.__setitem__(int(p["address"]), int(p["error"])),
+            "wrong_position": misread,
+            "keeps_turns": lambda _: setattr(servo, "keeps_turns", True),
             "torque_off": lambda _: servo.switch_torque_off(),
             "turns_lost": lambda p: servo.lose_turns(int(p["turns_n"])),
             "wrong_model": lambda p: servo.memory.__setitem__("model_number", int(p["model_n"])),
@@ -263,6 +271,9 @@ class VirtualServoBus:
         for packet in packets:
             self.requests_n += 1
             baud_n = self.baud_n
+            if self._strikes("damage_requests"):
+                self._send(encode_status(packet.packet_id, StatusError.CRC), now_s)
+                continue
             ready_s = now_s + wire_s(len(packet.raw), baud_n)
             for servo, reply in answers(self.servos, packet, now_s):
                 ready_s += servo.memory["return_delay_time"] * _RETURN_DELAY_STEP_S + wire_s(len(reply), baud_n)
@@ -297,6 +308,10 @@ class VirtualServoBus:
             reply = reply[: at // 8] + bytes((reply[at // 8] ^ 1 << at % 8,)) + reply[at // 8 + 1 :]
         if self._strikes("truncate"):
             reply = reply[: self._random.randrange(1, len(reply))]
+        if "babble" in self._faults:
+            reply = reply[:5] + int(self._faults["babble"]["length"]).to_bytes(2, "little") + reply
+        if "twin" in self._faults:
+            reply += reply
         if "noise" in self._faults:
             reply = self._random.randbytes(int(self._faults["noise"]["bytes_n"])) + reply
         return reply

@@ -26,6 +26,10 @@ class VirtualServo(ServoBody):
     def read(self, address: int, size: int) -> tuple[int, bytes]:
         """Error byte (with the alert bit) and data of a read; no data with an error."""
         self._publish()
+        position = self.table["present_position"]
+        if self.misread_n and address < position.end and position.address < address + size:
+            self.misread_n -= 1
+            self.memory["present_position"] += round(self.misread_deg / self._deg_per_count)
         try:
             return self.alert_bit, self.memory.read(address, size)
         except TableError as e:
@@ -33,6 +37,8 @@ class VirtualServo(ServoBody):
 
     def write(self, address: int, data: bytes, *, ram_only: bool = False) -> int:
         """Error number of a write; all of it or nothing takes effect."""
+        if address in self.refused:
+            return self.refused[address]
         try:
             changes = self._checked(address, data)
         except TableError as e:

@@ -25,6 +25,7 @@ class Ph54Stand(RotatorStand):
     """The virtual servo."""
 
     low, high, reached, still = -60.0, 60.0, 0.5, 0.3
+    of_the_wire = frozenset({"servo_bus.lossy"})
 
     def __init__(self, bench: Bench) -> None:
         self.bench = bench

@@ -10,11 +10,11 @@ import contextlib
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-import can
 import pytest
 
 from graderd.drivers.electrak import CanLink, ElectrakActuator
 from graderd.drivers.j1939.can_port import BusPort
+from graderd.drivers.j1939.python_can import can
 from graderd.hal.errors import (
     CommandRangeError,
     DeviceMissingError,

@@ -19,7 +19,7 @@ from tests.fakes import FakeActuator, FakeRotator
 
 
 class FakeRotatorStand(RotatorStand):
-    """A fake without dynamics, on a clock that moves when told."""
+    """A fake with no more than a speed, on a clock that moves when told."""
 
     low, high, reached, still = -FakeRotator.LIMIT, FakeRotator.LIMIT, 0.5, 0.01
     instant = True
@@ -43,6 +43,7 @@ class FakeRotatorStand(RotatorStand):
 
     async def wait(self, seconds: float) -> None:
         self.clock.advance(seconds)
+        self.fake.turn()
         await asyncio.sleep(0)
 
 

@@ -41,7 +41,7 @@ from graderd.hal.fault import DeviceFault
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import Rotator, RotatorTelemetry
-from graderd.hal.service import DeviceService
+from graderd.hal.service import DeviceService, NoArguments
 from graderd.hal.settings import CanSettings, Positive, RotatorSettings, Settings
 from graderd.runtime.app.backends import check_plugins, rotator_of
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
@@ -261,7 +261,7 @@ def _safe_off(settings: ValveSettings, can: CanSettings) -> str:
 
 
 def _services(rotator: ValveRotator) -> Mapping[str, DeviceService]:
-    async def feedback(_: dict[str, Any]) -> dict[str, Any]:
+    async def feedback(_: NoArguments) -> dict[str, Any]:
         return {"feedback_n": rotator.telemetry().counters["feedback_n"]}
 
     return {"feedback": DeviceService(feedback, only_reads=True)}

@@ -11,7 +11,6 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-import can
 import pytest
 
 from graderd.drivers.electrak import CanLink, ElectrakActuator, dump, safe_off
@@ -19,6 +18,7 @@ from graderd.drivers.j1939 import link as link_module
 from graderd.drivers.j1939.bus_health import BusEvent, event_of
 from graderd.drivers.j1939.can_port import PortLostError, SlcanPort, SocketCanPort, lost_from
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of
+from graderd.drivers.j1939.python_can import can
 from graderd.drivers.j1939.slcan_bus import QuietSlcanBus
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CanSettings, ElectrakSettings

@@ -115,6 +115,30 @@ async def test_the_bus_of_the_running_daemon_is_dumped_through_it(tmp_path: Path
         assert (await whole.status()).axes["tilt"].lifecycle == "standby"
 
 
+async def test_the_servos_wire_is_dumped_through_the_daemon(tmp_path: Path) -> None:
+    """Requests and answers with their registers, from the one owner of the port, which is not disturbed."""
+    async with machine(tmp_path) as whole:
+        await whole.until(lambda s: s.axes["rotation"].measured is not None)
+        dumping = await start(tmp_path, "rotation", "dump", "--json")
+        assert dumping.stdout is not None
+        seen: list[dict[str, Any]] = []
+        wanted = {"present_position", "hardware_error_status"}
+        async with asyncio.timeout(60):
+            while not wanted <= {name for packet in seen for name in packet["registers"]}:
+                seen.append(json.loads(await dumping.stdout.readline()))
+        answers = [p for p in seen if "present_position" in p["registers"]]
+        assert {(p["kind"], p["direction"], p["id"], p["error"]) for p in answers} == {("status", "rx", 1, "")}
+        assert all(p["registers"]["present_temperature"]["unit"] == "degC" for p in answers)
+        asked = {p["address"] for p in seen if p["kind"] == "read" and p["direction"] == "tx"}
+        assert {p["address"] for p in answers} <= asked
+        assert [p for p in seen if p["kind"] == "damaged"] == []
+        dumping.send_signal(signal.SIGINT)
+        async with asyncio.timeout(30):
+            _, err = await dumping.communicate()
+        assert err == b""
+        assert (await whole.status()).axes["rotation"].lifecycle == "standby"
+
+
 async def test_a_wrong_configuration_is_told_and_nothing_starts(tmp_path: Path) -> None:
     config = tmp_path / "wrong.toml"
     config.write_text("[rotation]\nmax_dg = 45.0\n")

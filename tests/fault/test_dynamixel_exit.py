@@ -150,7 +150,7 @@ async def test_safe_off_after_the_daemon_died(tmp_path: Path, at_exit: str) -> N
 
 async def test_safe_off_says_what_is_wrong(tmp_path: Path) -> None:
     with pytest.raises(DeviceMissingError):
-        safe_off(Ph54Settings(port=str(tmp_path / "none")))
+        await asyncio.to_thread(safe_off, Ph54Settings(port=str(tmp_path / "none")))
     wire = VirtualServoBus([VirtualServo()], tmp_path / "servo")
     await wire.start()
     wire.inject("drop")

@@ -180,6 +180,7 @@ async def test_lost_turns_behind_a_gear_need_a_person(tmp_path: Path) -> None:
     servo.shaft_deg = 400.0
     async with bench(tmp_path, servo, gear_ratio=10.0, speed_deg_per_s=8.3) as rig:
         assert rig.at(40.0)()
+        rig.rotator.confirm_turns()
         await rig.rotator.arm()
         await rig.drive(45.0, rig.at(45.0))
         await rig.rotator.disarm()

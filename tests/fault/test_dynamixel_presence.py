@@ -8,9 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from graderd.drivers.dynamixel import Ph54Rotator
+from graderd.drivers.dynamixel import Ph54Rotator, servo_task
+from graderd.drivers.dynamixel.connection import ServoLink
 from graderd.drivers.dynamixel.servo_task import ServoTask
-from graderd.hal.errors import DeviceError, DeviceMissingError, DeviceRefusedError, DeviceTimeoutError, WrongDeviceError
+from graderd.hal.errors import (
+    DeviceError,
+    DeviceMissingError,
+    DeviceRefusedError,
+    DeviceTimeoutError,
+    LifecycleError,
+    WrongDeviceError,
+)
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
@@ -150,6 +158,26 @@ async def test_an_unexpected_exception_does_not_end_the_search(rig: Bench, monke
     await works_again(rig)
 
 
+async def test_the_pause_between_two_looks_for_a_lost_servo_is_bounded(
+    rig: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long it was away, it is found soon after it is back: twenty doublings would be days."""
+    looks: list[float] = []
+
+    async def absent(_: ServoLink) -> None:
+        looks.append(rig.clock.now_s())
+        raise DeviceMissingError("/dev/servo", "no such serial port")
+
+    monkeypatch.setattr(servo_task, "_RECONNECT_FIRST_S", 0.001)
+    monkeypatch.setattr(servo_task, "_RECONNECT_MOST_S", 0.01)
+    with monkeypatch.context() as patch:
+        patch.setattr(ServoLink, "connect", absent)
+        await rig.bus.unplug()
+        await rig.until(lambda: len(looks) > 20, "no more looks for the servo")
+    await rig.bus.replug()
+    await rig.until(lambda: rig.rotator.lifecycle is Lifecycle.STANDBY, "not found again")
+
+
 async def test_a_reboot_needs_standby(rig: Bench) -> None:
     await rig.rotator.arm()
     with pytest.raises(DeviceError, match="standby"):
@@ -187,3 +215,47 @@ async def test_arming_is_refused_outside_the_limits_and_in_motion(rig: Bench) ->
     with pytest.raises(DeviceRefusedError, match=r"turns at"):
         await rig.rotator.arm()
     assert not rig.servo.torque_enabled
+
+
+async def test_a_servo_refused_for_its_settings_can_still_be_verified(tmp_path: Path) -> None:
+    servo = VirtualServo()
+    async with bench(tmp_path, servo) as rig:
+        await rig.bus.unplug()
+        await rig.until(lambda: rig.rotator.lifecycle is Lifecycle.FAILED)
+        servo.memory["drive_mode"] = 1
+        await rig.bus.replug()
+        await rig.until(lambda: "wrong_device" in rig.conditions())
+        found = await rig.rotator.verify_profile()
+        assert [d.register for d in found if d.kind != "default"] == ["drive_mode"]
+        servo.memory["drive_mode"] = 0
+        await works_again(rig)
+
+
+async def test_what_arming_wrote_is_no_difference(rig: Bench) -> None:
+    await rig.rotator.arm()
+    await rig.rotator.disarm()
+    assert rig.servo.memory["current_limit"] == 9300  # not the factory's
+    assert await rig.rotator.verify_profile() == []
+    rig.servo.memory["current_limit"] = 5000
+    assert [d.kind for d in await rig.rotator.verify_profile()] == ["default"]
+
+
+@pytest.mark.timeout(90)
+async def test_a_scan_finds_ids_and_baud_rates_and_the_servo_comes_back(tmp_path: Path) -> None:
+    servo, other = VirtualServo(), VirtualServo(17)
+    wire = VirtualServoBus([servo, other], tmp_path / "servo", strict_baud=True)
+    await wire.start()
+    rotator = Ph54Rotator(Ph54Settings(port=str(wire.link)))
+    try:
+        await rotator.open()
+        await rotator.arm()
+        with pytest.raises(LifecycleError, match="armed"):
+            await rotator.scan()
+        await rotator.disarm()
+        found = await rotator.scan()
+        assert [(f.baud_n, f.servo_id_n, f.model_n) for f in found] == [(57_600, 1, 2020), (57_600, 17, 2020)]
+        await until(lambda: rotator.lifecycle is Lifecycle.STANDBY, "not found again")
+        await rotator.arm()
+    finally:
+        await rotator.close()
+        await wire.close()

@@ -15,7 +15,7 @@ import pytest
 from graderd.simulator.control_client import RigControl
 from tests.machine import READY_S, machine, start_rig
 
-pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(240)]
+pytestmark = pytest.mark.timeout(240)
 
 
 async def test_the_demonstration_turns_the_blade_by_what_the_camera_sees() -> None:
@@ -87,6 +87,7 @@ async def test_a_demonstration_ended_from_outside_says_so_and_leaves_nothing(tmp
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.serial_only
 async def test_the_servo_stops_by_its_own_watchdog_when_the_daemon_is_killed(tmp_path: Path) -> None:
     async with machine(tmp_path) as whole:
         await whole.turn()
@@ -110,6 +111,7 @@ async def test_the_servo_stops_by_its_own_watchdog_when_the_daemon_is_killed(tmp
         assert stopped_s < 2.0
 
 
+@pytest.mark.serial_only
 async def test_a_dead_rig_is_named_held_and_back_in_standby_when_it_returns(tmp_path: Path) -> None:
     async with machine(tmp_path) as whole:
         await whole.turn()
@@ -128,7 +130,8 @@ async def test_a_dead_rig_is_named_held_and_back_in_standby_when_it_returns(tmp_
         assert (await whole.status()).mode == "disarmed"
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.serial_only
 async def test_a_signal_in_mid_turn_ends_everything_within_two_seconds(tmp_path: Path, number: signal.Signals) -> None:
     async with machine(tmp_path) as whole:
         await whole.turn()
@@ -143,6 +146,7 @@ async def test_a_signal_in_mid_turn_ends_everything_within_two_seconds(tmp_path:
         assert not (tmp_path / "graderd.sock").exists()
 
 
+@pytest.mark.serial_only
 async def test_a_second_daemon_on_the_same_socket_says_so_and_disturbs_nothing(tmp_path: Path) -> None:
     async with machine(tmp_path) as whole:
         await whole.until(lambda s: all(a.lifecycle == "standby" for a in s.axes.values()))

@@ -39,7 +39,8 @@ packages = {packages}
 BUILD = "import sys; from setuptools import build_meta; print(build_meta.build_wheel(sys.argv[1]))"
 READY_S = 90.0
 
-pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(300)]
+# One environment for all of them; none has a short deadline.
+pytestmark = [pytest.mark.xdist_group("installed"), pytest.mark.timeout(300)]
 
 
 def lay_generic(folder: Path) -> None:

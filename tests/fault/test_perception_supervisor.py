@@ -88,6 +88,21 @@ async def test_frames_flow_and_each_is_taken_once(tmp_path: Path) -> None:
         assert eyes.frames_per_s > 1
 
 
+async def test_a_frame_that_has_grown_old_decides_nothing(tmp_path: Path) -> None:
+    """It waited where it was not taken: by now the machine has driven on."""
+    patient = CAMERA.model_copy(update={"stale_s": 60.0, "restart_s": 120.0})
+    async with worker(tmp_path, "opened()\nframe()\ntime.sleep(600)\n", patient) as eyes:
+        await until(lambda: eyes.newest is not None)
+        newest, clock = eyes.newest, SystemClock()
+        assert newest is not None
+        assert newest.zone is Zone.LEFT
+        await until(lambda: clock.now_s() - newest.capture_s > PerceptionSettings().decision.max_frame_age_s)
+        taken = eyes.take_observation()
+        assert taken is not None
+        assert taken.zone is Zone.UNKNOWN
+        assert "old by now" in taken.reason
+
+
 async def test_frames_that_stop_are_unknown_at_once_and_the_child_is_replaced(tmp_path: Path) -> None:
     body = "opened()\nfor n in range(5):\n    frame(n); time.sleep(0.03)\nsignal.pause()\n"
     async with worker(tmp_path, body) as eyes:

@@ -23,7 +23,8 @@ import pytest
 from tests.unit.test_cli_offline import leaf_commands
 from tests.users import CONFIG, DAEMON, OPERATOR, ROOT, STATE, STRANGER, Machine, environment, three_users
 
-pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(600)]
+# One machine for all of them; none measures time.
+pytestmark = [pytest.mark.xdist_group("three users"), pytest.mark.timeout(600)]
 READY_S = 120.0
 POSE = "0.9,0.05,0.6,30,1,-1"
 USERS = (DAEMON, OPERATOR, STRANGER)

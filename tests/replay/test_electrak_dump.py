@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import can
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,6 +18,7 @@ from graderd.drivers.j1939.bus_health import BusEvent
 from graderd.drivers.j1939.can_logs import candump_line, parse_candump_line, read_file
 from graderd.drivers.j1939.dm1 import dtc_of, encode
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id
+from graderd.drivers.j1939.python_can import can
 from graderd.drivers.j1939.transport import Transport
 from graderd.hal.errors import ProtocolError
 
@@ -319,7 +319,7 @@ def test_the_command_line_writes_json_and_survives_a_closed_pipe(tmp_path: Path)
 
 
 def test_candump_text_on_standard_input_is_read_and_what_is_written_is_read_again() -> None:
-    text = "# 2 frames lost: the reader is too slow\n" + "".join(f"{candump_line(f, t)}\n" for t, f in FRAMES)
+    text = "# 2 lines lost: the reader is too slow\n" + "".join(f"{candump_line(f, t)}\n" for t, f in FRAMES)
     done = subprocess.run(
         [sys.executable, "-m", "graderd.drivers.electrak.dump", "-", "--json"],
         input=text, capture_output=True, text=True, check=True,

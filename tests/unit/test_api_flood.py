@@ -9,11 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from graderd.api.limiter import Pace
+from graderd.api.pace import Pace
 from graderd.api.settings import ApiLimits
+from graderd.api.stop_socket import stop_socket_beside
 from graderd.core.machine import Mode
 from harness.api_daemon import TICK_S, serving, within
 from tests.unit.test_cli_modes import command_line
+
+pytestmark = pytest.mark.live
 
 FLOOD_S = 2.5
 
@@ -60,6 +63,43 @@ async def test_the_tick_goes_on_and_stop_gets_through(
     limits = ApiLimits()
     assert tasks_n < 3 * limits.connections_max_n
     assert [record for record in caplog.records if record.levelname in ("ERROR", "CRITICAL")] == []
+
+
+COLD = """
+import socket, sys, time
+began_s = time.monotonic()
+with socket.socket(socket.AF_UNIX) as connection:
+    connection.connect(sys.argv[1])
+    connection.sendall(b"flooded")
+    answer = connection.recv(4096)
+print(time.monotonic() - began_s, answer.split()[1].decode())
+"""
+STOP_S = 0.1
+
+
+@pytest.mark.serial_only
+@pytest.mark.parametrize(("kind", "connections_n"), [("ask", 400), ("hammer", 50), ("stop", 400)])
+async def test_the_stop_socket_is_nobodys_queue(tmp_path: Path, kind: str, connections_n: int) -> None:
+    """From a new process's connect to its answer, beside clients that fill the queue of the interface itself."""
+    async with serving(tmp_path) as (daemon, path):
+        flood = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "harness.api_flood", str(path), "4", kind, str(connections_n)),
+            stdout=asyncio.subprocess.PIPE,
+        )
+        await asyncio.sleep(1.5)  # the flood's own start
+        took_s = []
+        for _ in range(5):
+            stop = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-S", "-c", COLD, str(stop_socket_beside(path))), stdout=asyncio.subprocess.PIPE
+            )
+            told, _ = await within(20, stop.communicate())
+            assert told.split()[1] == b"200"
+            took_s.append(float(told.split()[0]))
+        assert daemon.state.mode is Mode.STOPPED
+        assert flood.stdout is not None
+        await within(30, flood.stdout.read())
+        await flood.wait()
+    assert sorted(took_s)[2] < STOP_S, took_s
 
 
 @pytest.mark.serial_only

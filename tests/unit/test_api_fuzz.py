@@ -19,6 +19,8 @@ from graderd.api.settings import ApiLimits
 from graderd.core.machine import Mode, Unmet
 from harness.api_daemon import FakeDaemon, serving
 
+pytestmark = pytest.mark.live
+
 NO_LIMITS = ApiLimits(rate_hz=1e6, burst_n=10**6, stop_rate_hz=1e6, accept_rate_hz=1e6, command_timeout_s=30.0)
 MANY = settings(
     max_examples=200,

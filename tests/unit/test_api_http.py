@@ -24,6 +24,8 @@ from graderd.core.machine import Mode, Unmet
 from graderd.core.status import Status
 from harness.api_daemon import JPEG, FakeDaemon, serving, within
 
+pytestmark = pytest.mark.live
+
 
 @contextlib.asynccontextmanager
 async def client_of(path: Path) -> AsyncIterator[httpx.AsyncClient]:
@@ -86,7 +88,7 @@ MALFORMED: list[tuple[bytes, str]] = [
     (b"null", "body"),
     (b'"stop"', "body"),
     (b'{"command": "fly"}', "body"),
-    (b'{"command": "stop", "now": true}', "stop.now"),
+    (b'{"command": "manual", "now": true}', "manual.now"),
     (b'{"command": "jog", "axis": "rotate", "value": NaN}', "jog.value"),
     (b'{"command": "jog", "axis": "rotate", "value": Infinity}', "jog.value"),
     (b'{"command": "jog", "axis": "rotate", "value": 1e999}', "jog.value"),
@@ -113,7 +115,7 @@ async def test_malformed_commands_are_told_plainly_and_change_nothing(tmp_path: 
 
 async def test_a_large_body_is_refused_and_the_next_request_served(tmp_path: Path) -> None:
     async with serving(tmp_path) as (_, path), client_of(path) as client:
-        for target in ("/v1/commands", "/v1/stop", "/v1/services/rotation.reboot"):
+        for target in ("/v1/commands", "/v1/services/rotation.reboot"):
             answer = await client.post(target, content=b" " * 20_000)
             assert answer.status_code == 413
             assert "16384" in answer.json()["error"]
@@ -147,7 +149,7 @@ async def test_paths_and_methods_that_do_not_exist(tmp_path: Path) -> None:
         assert (await client.get("/nothing")).status_code == 404
         assert (await client.get("/nothing")).json()["where"] == "/nothing"
         assert (await client.delete("/v1/status")).status_code == 405
-        for stream in ("/v1/stream", "/v1/jog", "/v1/can"):
+        for stream in ("/v1/stream", "/v1/jog", "/v1/bus/can"):
             answer = await client.get(stream)
             assert answer.status_code == 426
             assert "WebSocket" in answer.json()["error"]
@@ -259,10 +261,12 @@ async def test_the_description_is_complete(tmp_path: Path) -> None:
         "/v1/stop",
         "/v1/config",
         "/v1/preview.jpg",
-        "/v1/services/{name}",
+        "/v1/services/rotation.verify_profile",
+        "/v1/services/rotation.reboot",
+        "/v1/services/rotation.step_response",
         "/v1/stream",
         "/v1/jog",
-        "/v1/can",
+        "/v1/bus/{name}",
     }
     for operations in paths.values():
         for operation in operations.values():
@@ -272,11 +276,31 @@ async def test_the_description_is_complete(tmp_path: Path) -> None:
     commands = {reference.rsplit("/", 1)[1] for reference in body["schema"]["discriminator"]["mapping"].values()}
     assert commands == {"Arm", "Disarm", "Stop", "Reset", "Auto", "Manual", "Jog", "Preset", "Renew", "Release"}
     assert set(body["examples"]) >= {"arm", "stop", "jog"}
+    step = paths["/v1/services/rotation.step_response"]["post"]["requestBody"]["content"]["application/json"]["schema"]
+    arguments = description["components"]["schemas"]["RotationStepResponseRequest"]["properties"]
+    assert "RotationStepResponseRequest" in json.dumps(step)
+    assert {name: one["type"] for name, one in arguments.items()} == {"step_deg": "number", "consent": "boolean"}
     assert {"409", "422", "503", "504"} <= set(paths["/v1/commands"]["post"]["responses"])
     text = json.dumps(description, allow_nan=False)
     schemas = set(re.findall(r'"#/components/schemas/(\w+)"', text))
     assert schemas <= set(description["components"]["schemas"])
     assert {"Status", "Reply", "Problem", "AxisStatus", "FaultStatus"} <= schemas
+
+
+async def test_the_oldest_connection_makes_room_for_a_new_one(tmp_path: Path) -> None:
+    """Whoever wants to stop the machine gets in, however many connections hang about."""
+    async with serving(tmp_path, limits=ApiLimits(connections_max_n=4)) as (daemon, path):
+        idle = [await asyncio.open_unix_connection(str(path)) for _ in range(4)]
+        async with client_of(path) as client:
+            assert (await client.post("/v1/stop")).status_code == 200
+        assert daemon.status().mode is Mode.STOPPED
+        with contextlib.suppress(ConnectionResetError):
+            assert await within(5, idle[0][0].read()) == b""
+        assert not idle[1][0].at_eof()
+        for _, writer in idle:
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
 
 
 async def test_requests_that_wait_when_the_daemon_ends_are_answered(
@@ -295,3 +319,41 @@ async def test_requests_that_wait_when_the_daemon_ends_are_answered(
     writer.close()
     await writer.wait_closed()
     assert [record for record in caplog.records if record.levelname == "ERROR"] == []
+
+
+@pytest.mark.parametrize("name", ["", "cab", "jog#1", "cab#1", "maneuver"])
+async def test_the_name_of_a_lease_is_the_daemons(tmp_path: Path, name: str) -> None:
+    """Whatever a client calls itself: nobody renews, moves or gives back on another connection's lease."""
+    jog = {"command": "jog", "axis": "rotate", "value": 50.0, "client": name}
+    async with serving(tmp_path) as (daemon, path), client_of(path) as one, client_of(path) as other:
+        await one.post("/v1/commands", json={"command": "arm"})
+        await daemon.until_mode(Mode.MANUAL)
+        assert (await one.post("/v1/commands", json=jog)).status_code == 200
+        assert daemon.state.lease is not None
+        for command in ({"command": "renew", "client": name}, {"command": "release", "client": name}, jog):
+            for taken in (name, daemon.state.lease.client):
+                assert (await other.post("/v1/commands", json={**command, "client": taken})).status_code == 409
+            assert (await one.post("/v1/commands", json={"command": "renew"})).status_code == 200
+
+
+@pytest.mark.parametrize("consent", ["false", "no", "true", [0], -1, 1, 1.0, {}, None])
+async def test_consent_is_true_and_nothing_that_only_counts_as_true(tmp_path: Path, consent: Any) -> None:
+    async with serving(tmp_path) as (daemon, path), client_of(path) as client:
+        answer = await client.post("/v1/services/rotation.step_response", json={"consent": consent})
+        assert answer.status_code == 422
+        assert answer.json()["where"] == "consent"
+        answer = await client.post("/v1/services/rotation.step_response", json={"consent": True, "step": 5})
+        assert (answer.status_code, answer.json()["where"]) == (422, "step")
+        assert daemon.maneuvers == []
+
+
+async def test_a_service_that_moves_ends_with_its_client(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        _, writer = await asyncio.open_unix_connection(str(path))
+        writer.write(
+            b"POST /v1/services/rotation.step_response HTTP/1.1\r\nHost: localhost\r\nContent-Length: 17\r\n"
+            b'Content-Type: application/json\r\n\r\n{"consent": true}'
+        )
+        await daemon.until(lambda: daemon.maneuvers == ["began"])
+        writer.close()
+        await daemon.until(lambda: daemon.maneuvers == ["began", "ended"])

@@ -12,10 +12,13 @@ from websockets.asyncio.client import ClientConnection, unix_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from graderd.api.settings import ApiLimits
+from graderd.client import AsyncClient, RefusedError
 from graderd.core import commands as cmd
-from graderd.core.machine import Mode
+from graderd.core.machine import MachineSettings, Mode
 from graderd.core.status import Status
 from harness.api_daemon import FakeDaemon, serving, within
+
+pytestmark = pytest.mark.live
 
 
 def connect(path: Path, target: str) -> Any:
@@ -46,10 +49,18 @@ async def test_the_stream_sends_newer_and_newer_statuses_at_the_rate_asked_for(t
 
 async def test_the_bus_is_sent_as_it_comes_and_let_go_when_the_client_goes(tmp_path: Path) -> None:
     async with serving(tmp_path) as (daemon, path):
-        async with connect(path, "/v1/can") as socket:
+        async with connect(path, "/v1/bus/can") as socket:
             assert await within(5, socket.recv()) == "(1.000000) can0 18EF1300#DC05191500000000\n"
-            assert str(await within(5, socket.recv())).startswith("# 3 frames lost")
+            assert str(await within(5, socket.recv())).startswith("# 3 lines lost")
         await daemon.until(lambda: daemon.bus_watched_n == 1)
+
+
+async def test_a_bus_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (_, path), AsyncClient(path) as client:
+        with pytest.raises(RefusedError, match=r"there is no bus 'ser vo'\. there are: can") as refused:
+            async with client.bus_text("ser vo"):
+                raise AssertionError("it was opened")
+        assert refused.value.status_code == 404
 
 
 async def test_a_slow_client_gets_no_old_statuses_and_makes_nothing_grow(tmp_path: Path) -> None:
@@ -111,6 +122,17 @@ async def test_the_lease_is_given_back_when_the_client_goes(tmp_path: Path, how:
         await daemon.until(lambda: daemon.state.lease is None, timeout_s=1.0)
         assert daemon.state.reason == "released"
         assert daemon.positions["rotation"] < 30.0
+
+
+async def test_the_lease_of_a_preset_is_given_back_when_the_client_goes(tmp_path: Path) -> None:
+    async with serving(tmp_path, FakeDaemon(settings=MachineSettings(lease_s=60.0))) as (daemon, path):
+        await armed(daemon)
+        socket = await connect(path, "/v1/jog")
+        assert (await ask(socket, command="preset", name="transport"))["accepted"]
+        assert daemon.state.lease is not None
+        await socket.close()
+        await daemon.until(lambda: daemon.state.lease is None, timeout_s=5.0)
+        assert daemon.state.reason == "released"
 
 
 async def test_nobody_keeps_somebody_elses_lease(tmp_path: Path) -> None:

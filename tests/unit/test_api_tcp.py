@@ -26,6 +26,8 @@ from graderd.core.machine import Mode
 from graderd.hal.errors import DeviceError
 from harness.api_daemon import FakeDaemon, longest_hold, serving, within
 
+pytestmark = pytest.mark.live
+
 HOLD_S = 0.05
 """What the interface may keep the tick waiting, in computing time: what else the machine does does not count."""
 
@@ -129,6 +131,26 @@ def test_the_token_is_made_once_and_kept_private(tmp_path: Path) -> None:
         load_or_make_token(path)
     with pytest.raises(DeviceError, match="No such file"):
         load_or_make_token(tmp_path / "missing" / "token")
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o620, 0o610, 0o604, 0o602, 0o601])
+def test_a_token_that_the_group_may_read_is_none(tmp_path: Path, mode: int) -> None:
+    path = tmp_path / "token"
+    load_or_make_token(path)
+    path.chmod(mode)
+    with pytest.raises(DeviceError, match=f"chmod 600 {path}"):
+        load_or_make_token(path)
+
+
+async def test_a_token_in_the_query_of_a_plain_request_is_none(tmp_path: Path) -> None:
+    """It would stay in histories and logs; only a browser's WebSocket has no other place for it."""
+    tcp = tcp_settings(tmp_path)
+    async with serving(tmp_path, tcp=tcp):
+        token = tcp.token_file.read_text().strip()
+        async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{tcp.port_n}", trust_env=False) as client:
+            for upgrade in ({}, {"Upgrade": "h2c"}):
+                answer = await client.get(f"/v1/status?token={token}", headers=upgrade)
+                assert answer.status_code == 401
 
 
 # ---- strangers, and floods ------------------------------------------------------------------------------------------

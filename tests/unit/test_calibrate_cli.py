@@ -28,6 +28,8 @@ from graderd.perception.frame_set import Entry, FrameSetWriter
 from graderd.perception.settings import StreamCalibration
 from harness.perception_scenes import Scene, render
 
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("calibrate cli")]  # one set of pictures for all
+
 Captured = pytest.CaptureFixture[str]
 COLOR, DEPTH = (480, 300), (424, 240)
 CONFIG = '# mine\n[perception]\nmethod = "depth"  # on purpose\n\n[rotation]\nspeed_deg_per_s = 20.0\n'

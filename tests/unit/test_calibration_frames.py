@@ -67,6 +67,7 @@ def test_no_other_file_is_given(state: Path, name: str) -> None:
         frames.take("camera.json")
 
 
+@pytest.mark.live
 def test_it_goes_with_the_daemon(state: Path) -> None:
     code = "from graderd.runtime.app.calibration_frames import CalibrationFrames as F; print(F().begin().is_dir())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

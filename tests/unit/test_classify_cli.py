@@ -18,6 +18,8 @@ from graderd.perception.settings import StreamCalibration
 from harness.perception_scenes import Scene, height_field, render, volumes_l
 from harness.realsense_devices import SoftD455, record
 
+pytestmark = pytest.mark.xdist_group("classify cli")  # one set of pictures for all
+
 FIELDS = [
     "id",
     "zone",

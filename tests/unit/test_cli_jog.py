@@ -5,7 +5,10 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import os
+import shlex
 import signal
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +19,14 @@ from hypothesis import strategies as st
 from graderd.api.settings import ApiLimits
 from graderd.cli.console import CliError
 from graderd.cli.move import VALUE, Arrival, JogValue, parse_value
+from graderd.core import commands as cmd
 from graderd.core.axes import JOG_AXES, JogName
 from graderd.core.machine import Mode
 from graderd.core.status import FaultStatus
 from harness.api_daemon import FakeDaemon, serving, within
 from tests.unit.test_cli_modes import Capture, cli, command_line
+
+pytestmark = pytest.mark.live
 
 
 @pytest.mark.parametrize(
@@ -226,9 +232,49 @@ async def test_the_blade_holds_when_the_command_dies(tmp_path: Path, how: signal
         await daemon.until(lambda: daemon.state.lease is None)
         stood = dict(daemon.positions)
         await process.wait()
+        assert process.returncode == -how  # not 0: `graderd jog … && graderd jog …` must not go on
         assert daemon.status().mode is Mode.MANUAL
         assert daemon.state.reason == "released"
         assert daemon.positions == stood
+
+
+@pytest.mark.parametrize(("line", "moved_n"), [("{jog} && {next}", 1), ("for i in 1 2 3; do {next}; done", 1)])
+async def test_ctrl_c_ends_what_the_shell_would_do_next(tmp_path: Path, line: str, moved_n: int) -> None:
+    """As a terminal sends it: to the shell and its command alike."""
+    async with serving(tmp_path) as (daemon, path):
+        assert await cli(path, "arm") == 0
+        jog = shlex.join(command_line(path, "jog", "rotate", "+30deg", "--hold-s", "50"))
+        shell = await asyncio.create_subprocess_exec(
+            *("bash", "-c", line.format(jog=jog, next=jog)), stdout=asyncio.subprocess.DEVNULL, start_new_session=True
+        )
+        await daemon.until(lambda: daemon.state.lease is not None, timeout_s=30)
+        os.killpg(shell.pid, signal.SIGINT)
+        await within(20, shell.wait())
+        jogs_n = sum(isinstance(command, cmd.Jog) for command in daemon.seen)
+        assert jogs_n == moved_n
+        await daemon.until(lambda: daemon.state.lease is None, timeout_s=0.5)
+
+
+@pytest.mark.parametrize("module", ["typer", "graderd.cli.app", "graderd.client", "websockets.sync.client"])
+async def test_ctrl_c_during_the_start_ends_by_sigint_too(tmp_path: Path, module: str) -> None:
+    """Interrupted in the import of ``module``."""
+    code = f"""
+import importlib.abc, os, signal, sys
+class Interrupt(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupt())
+from graderd.cli import main
+main(["--socket", {str(tmp_path / "api.sock")!r}, "jog", "rotate", "+30deg"])
+"""
+    async with serving(tmp_path) as (daemon, path):
+        assert await cli(path, "arm") == 0
+        process = await asyncio.create_subprocess_exec(sys.executable, "-c", code, stderr=asyncio.subprocess.PIPE)
+        _, said = await within(30, process.communicate())
+        assert process.returncode == -signal.SIGINT, said
+        assert b"Traceback" not in said
+        assert not any(isinstance(command, cmd.Jog) for command in daemon.seen)
 
 
 async def test_a_stalled_client_loses_its_lease(tmp_path: Path) -> None:

@@ -22,6 +22,8 @@ from graderd.cli.status import sections
 from graderd.core.machine import Mode, Unmet
 from harness.api_daemon import FakeDaemon, serving, within
 
+pytestmark = pytest.mark.live
+
 Capture = pytest.CaptureFixture[str]
 
 

@@ -49,6 +49,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         (["stop"], 3),
         (["preset", "transport"], 3),
         (["can", "dump"], 3),
+        (["rotation", "dump"], 3),
         (["run"], 2),
         (["config", "check"], 1),
         (["config", "show"], 1),
@@ -112,6 +113,7 @@ def test_the_configured_socket_comes_first(tmp_path: Path, monkeypatch: pytest.M
     assert client.default_socket() == places.SOCKET
 
 
+@pytest.mark.live
 def test_stop_loads_nothing_heavy_to_find_its_socket() -> None:
     code = "import sys, graderd.client as c; c.default_socket(); "
     code += "print([m for m in ('pydantic', 'numpy', 'tomlkit', 'graderd.config') if m in sys.modules])"

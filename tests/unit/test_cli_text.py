@@ -7,7 +7,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import can
 import httpx
 import pytest
 from rich.console import Console
@@ -17,9 +16,12 @@ from graderd.cli.console import error_line, plain_table, print_json, print_text,
 from graderd.cli.status import summary
 from graderd.core.machine import Mode
 from graderd.drivers.electrak.dump import FrameDecoder, text_of
+from graderd.drivers.j1939.python_can import can
 from graderd.runtime.sd_notify import SystemdNotifier
 from harness.api_daemon import serving, within
 from tests.unit.test_cli_modes import Capture, cli
+
+pytestmark = pytest.mark.live
 
 HOSTILE = "stop\nmode  auto: all is well\x1b[2J\x1b]0;title\x07\x9b31m\u202e\r"
 SHOWN = "stop\\nmode  auto: all is well\\x1b[2J\\x1b]0;title\\x07\\x9b31m\\u202e\\r"

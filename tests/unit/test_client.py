@@ -27,6 +27,8 @@ from graderd.client import (
 from graderd.core.machine import Mode, Unmet
 from harness.api_daemon import JPEG, FakeDaemon, serving
 
+pytestmark = pytest.mark.live
+
 
 async def in_thread(work: Callable[[], Any]) -> Any:
     """The daemon lives in this event loop, so a client that waits does it elsewhere."""

@@ -56,11 +56,11 @@ def bounds(
                 yield from bounds(inner, here, (*above, model))
 
 
-BOUNDS = {
-    path: bound
-    for path, bound in bounds(Config)
-    if (RESTS_ON.search(path) or path.split(".")[0] in WHOLE_SECTIONS) and path not in NO_BOUND_NEEDED
-}
+BOUNDS: dict[str, Any] = {}
+for _path, _bound in bounds(Config):
+    if (RESTS_ON.search(_path) or _path.split(".")[0] in WHOLE_SECTIONS) and _path not in NO_BOUND_NEEDED:
+        # a section may be one of several models: each of them needs the bound
+        BOUNDS[_path] = None if _bound is None else BOUNDS.get(_path, _bound)
 
 
 def config(**changes: Any) -> Config:

@@ -135,6 +135,7 @@ def writer(path: Path, times_n: int, before: Callable[[], None] | None = None) -
     return process
 
 
+@pytest.mark.live
 def test_two_writers_wait_for_each_other(config: Path) -> None:
     config.write_text("[recording]\nmax_mb = 100\n")
     writers = [writer(config, 20) for _ in range(2)]
@@ -150,6 +151,7 @@ def test_two_writers_wait_for_each_other(config: Path) -> None:
     assert sorted(os.listdir(config.parent)) == [config.name, *backups(config)]
 
 
+@pytest.mark.live
 def test_a_disk_that_is_really_full(config: Path) -> None:
     """The kernel's own refusal in the middle of a write: this process may write no file longer than 30 bytes."""
     config.write_text("[recording]\nmax_mb = 100\n# " + 60 * "x")
@@ -166,6 +168,7 @@ def test_a_disk_that_is_really_full(config: Path) -> None:
     assert os.listdir(config.parent) == [config.name]
 
 
+@pytest.mark.live
 def test_a_writer_that_never_ends_is_told_and_a_reader_holds_nobody_up(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

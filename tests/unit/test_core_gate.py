@@ -13,12 +13,14 @@ from hypothesis import strategies as st
 
 from graderd.config import Config
 from graderd.core.axes import AXES, LIFTS, Goals, Pose
-from graderd.core.gate import STANDING_S, GateInputs, GateSettings, GateState, Setpoint, pass_gate
+from graderd.core.gate import LONGEST_STEP_S, STANDING_S, GateInputs, GateSettings, GateState, Setpoint, pass_gate
 from graderd.core.machine import ARMED, Mode
 from graderd.hal.settings import ElectrakSettings, Ph54Settings
 
 SETTINGS = GateSettings()
 FIGURES = Config().figures()
+REGULATED = {axis: replace(figures, profile_in_device=False) for axis, figures in FIGURES.items()}
+"""As for devices without a profile of their own: the gate itself moves every goal with speed and acceleration."""
 POSE = Pose(0.0, 100.0, 100.0, 50.0)
 DT_S = 0.02
 PACED = ("rotation", "tilt")
@@ -128,7 +130,7 @@ def test_speed_and_acceleration_are_limited_and_it_arrives_without_overshoot(axi
     limits = FIGURES[axis]
     start = getattr(POSE, FIELDS[axis])
     wanted = start + 0.6 * (limits.high - start)
-    path = [start, *[tick[axis] for tick in drive(goal(axis, wanted), inputs(), 1500)]]
+    path = [start, *[tick[axis] for tick in drive(goal(axis, wanted), inputs(figures=REGULATED), 1500)]]
     speeds = [(b - a) / DT_S for a, b in pairwise(path)]
     assert max(speeds) <= limits.speed + 1e-6
     assert max(speeds) == pytest.approx(limits.speed, rel=0.02)
@@ -146,7 +148,8 @@ def test_whatever_is_asked_the_goal_stays_inside_and_slow(asked: list[tuple[floa
     limits = FIGURES["rotation"]
     state, pose, last = GateState(), POSE, 0.0
     for value, lease in asked:
-        state, passed = pass_gate(state, Goals(rotation_deg=value), inputs(pose=pose, lease_ok=lease))
+        step = inputs(figures=REGULATED, pose=pose, lease_ok=lease)
+        state, passed = pass_gate(state, Goals(rotation_deg=value), step)
         limited = passed["rotation"].limited
         if limited is None:
             assert not lease
@@ -155,6 +158,23 @@ def test_whatever_is_asked_the_goal_stays_inside_and_slow(asked: list[tuple[floa
         assert abs(limited - last) <= limits.speed * DT_S + 1e-6
         last = limited
         pose = replace(pose, rotation_deg=limited)
+
+
+@given(st.lists(st.tuples(st.floats(-200, 200), st.floats(-75, 75)), min_size=1, max_size=60))
+@settings(max_examples=200)
+def test_a_device_with_its_own_profile_gets_the_goal_itself_inside_and_near(asked: list[tuple[float, float]]) -> None:
+    limits, state = replace(FIGURES["rotation"], window=1000.0), GateState()
+    for value, measured in asked:
+        step = inputs(figures=FIGURES | {"rotation": limits}, pose=replace(POSE, rotation_deg=measured))
+        state, passed = pass_gate(state, Goals(rotation_deg=value), step)
+        limited = passed["rotation"].limited
+        assert limited is not None
+        assert limits.low <= limited <= limits.high
+        inside = min(max(value, limits.low), limits.high)
+        if limits.low <= measured <= limits.high:
+            assert limited == pytest.approx(min(max(inside, measured - limits.lead), measured + limits.lead)) or (
+                abs(limited - measured) < limits.lead  # it stands although it is asked to move: the lead shrinks
+            )
 
 
 @pytest.mark.parametrize("axis", PACED)
@@ -168,7 +188,8 @@ def test_late_ticks_do_not_carry_it_past_a_standing_goal(axis: str, share: float
         state, pose, last = GateState(), POSE, getattr(POSE, FIELDS[axis])
         while last != wanted:
             dt_s = ticks.choice((0.001, 0.01, 0.02, 0.02, 0.021, 0.04, 0.08, 0.2))
-            state, passed = pass_gate(state, goal(axis, wanted), inputs(pose=pose, dt_s=dt_s))
+            step = inputs(figures=REGULATED, pose=pose, dt_s=dt_s)
+            state, passed = pass_gate(state, goal(axis, wanted), step)
             limited = passed[axis].limited
             assert limited is not None
             assert min(last, wanted) <= limited <= max(last, wanted)
@@ -198,7 +219,7 @@ def test_a_goal_moved_nearer_than_the_way_to_stop_is_passed_and_come_back_to() -
     state = GateState({"rotation": Setpoint(0.0, limits.speed, 0.0)})
     seen, pose = [0.0], POSE
     for _ in range(400):
-        state, passed = pass_gate(state, goal("rotation", 0.5 * way_to_stop), inputs(pose=pose))
+        state, passed = pass_gate(state, goal("rotation", 0.5 * way_to_stop), inputs(figures=REGULATED, pose=pose))
         limited = passed["rotation"].limited
         assert limited is not None
         seen.append(limited)
@@ -211,10 +232,11 @@ def test_a_goal_moved_nearer_than_the_way_to_stop_is_passed_and_come_back_to() -
 def test_pushed_outside_it_goes_in_and_never_further_out(at: float, first: float) -> None:
     sign = math.copysign(1.0, at)
     outward = GateState({"rotation": Setpoint(at, sign * 20.0, at)})
-    _, passed = pass_gate(outward, goal("rotation", 0.0), inputs(pose=replace(POSE, rotation_deg=at)))
+    pushed = inputs(figures=REGULATED, pose=replace(POSE, rotation_deg=at))
+    _, passed = pass_gate(outward, goal("rotation", 0.0), pushed)
     assert passed["rotation"].limited == first
     at_rest = GateState({"rotation": Setpoint(at, 0.0, at)})
-    _, passed = pass_gate(at_rest, goal("rotation", 50.0 * sign), inputs(pose=replace(POSE, rotation_deg=at)))
+    _, passed = pass_gate(at_rest, goal("rotation", 50.0 * sign), pushed)
     limited = passed["rotation"].limited
     assert limited is not None
     assert 60.0 < abs(limited) < 61.0
@@ -234,16 +256,37 @@ def test_rotation_waits_for_the_blade_height() -> None:
 
 
 def test_after_a_hold_it_starts_again_from_the_measured_position_at_rest() -> None:
-    state, given_inputs = GateState(), inputs()
+    state, given_inputs = GateState(), inputs(figures=REGULATED)
     for _ in range(20):
         state, _ = pass_gate(state, goal("rotation", 40.0), given_inputs)
     pushed = replace(POSE, rotation_deg=-3.0)
     state, passed = pass_gate(state, Goals(), inputs(pose=pushed))
     assert passed["rotation"].limited is None
     assert (state.setpoints["rotation"].position, state.setpoints["rotation"].speed) == (-3.0, 0.0)
-    state, passed = pass_gate(state, goal("rotation", 40.0), inputs(pose=pushed))
+    state, passed = pass_gate(state, goal("rotation", 40.0), inputs(figures=REGULATED, pose=pushed))
     limits = FIGURES["rotation"]
     assert passed["rotation"].limited == pytest.approx(-3.0 + limits.acceleration * DT_S * DT_S)
+
+
+def test_what_is_pushed_while_it_is_held_starts_from_where_it_is_now() -> None:
+    """Not from where it was in the tick before: that would be a leap in the very first tick."""
+    state, _ = pass_gate(GateState(), Goals(), inputs())
+    pushed = replace(POSE, rotation_deg=-30.0)
+    _, passed = pass_gate(state, goal("rotation", 40.0), inputs(pose=pushed, figures=REGULATED))
+    limits = REGULATED["rotation"]
+    assert passed["rotation"].limited == pytest.approx(-30.0 + limits.acceleration * DT_S * DT_S)
+
+
+@pytest.mark.parametrize("axis", PACED)
+def test_a_late_tick_is_not_made_up_for(axis: str) -> None:
+    """Drivers have held meanwhile: the goal goes on from there as if the tick had not been so late."""
+    limits = FIGURES[axis]
+    state = GateState({axis: Setpoint(getattr(POSE, FIELDS[axis]), limits.speed, getattr(POSE, FIELDS[axis]))})
+    for late_s in (0.11, 0.4, 3.0, 1e6):
+        _, passed = pass_gate(state, goal(axis, limits.high), inputs(dt_s=late_s, figures=REGULATED))
+        limited = passed[axis].limited
+        assert limited is not None
+        assert limited - getattr(POSE, FIELDS[axis]) <= LONGEST_STEP_S * limits.speed + 1e-9
 
 
 def test_a_measurement_lost_in_motion_holds_and_keeps_the_armed_pose() -> None:
@@ -290,7 +333,7 @@ def test_the_lead_shrinks_while_the_axis_stands_and_only_then(axis: str, sign: f
         return leads
 
     jammed = led(0.0, 3.0)
-    assert max(jammed) < 0.8 * limits.lead
+    assert max(jammed) < 0.8 * limits.lead or limits.profile_in_device
     settled = jammed[round((STANDING_S + limits.lead / limits.speed + 0.3) / DT_S) :]
     assert max(settled) <= max(0.2 * limits.lead, limits.tolerance) + 1e-9
     assert min(settled) > limits.tolerance, "the driver must see that it was told to move"

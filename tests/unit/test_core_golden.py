@@ -36,7 +36,7 @@ from graderd.core.faults.monitor import (
 )
 from graderd.core.gate import GateInputs, GateSettings, GateState, Setpoint, pass_gate
 from graderd.core.machine import MachineSettings, Mode, State, Step, Unmet, step
-from graderd.core.rule import RuleSettings
+from graderd.core.rule import RuleSettings, Travel
 from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.fault import DeviceFault
 from tests.unit.test_core_machine import EVENTS, NOW_S, STATES, do, fault
@@ -118,7 +118,7 @@ def machine_answers() -> Iterator[tuple[str, Any]]:
 
 
 def automatic_answers() -> Iterator[tuple[str, Any]]:
-    """A decision, a change of it, and a swing in between."""
+    """A decision, a change of it before the machine has started, and a swing in between."""
     state = STATES["auto"]
     for tick in range(60):
         now_s = NOW_S + 0.1 * tick
@@ -126,7 +126,8 @@ def automatic_answers() -> Iterator[tuple[str, Any]]:
         shares = (0.9, 0.0, 0.0) if left else (0.0, 0.0, 0.9)
         seen = SoilObservation(now_s, Zone.LEFT if left else Zone.RIGHT, 0.9, "", *shares)
         settled = tick not in range(6, 9)
-        result = do(state, now_s=now_s, observation=seen, settled=settled, devices_active=True)
+        travel = Travel(0.0, 3.0)
+        result = do(state, now_s=now_s, observation=seen, travel=travel, settled=settled, devices_active=True)
         state = result.state
         yield f"automatic, tick {tick}", [told(result), len(state.decision.votes)]
 
@@ -172,10 +173,11 @@ def gate_answers() -> Iterator[tuple[str, Any]]:
 def late_answers() -> Iterator[tuple[str, Any]]:
     """Ticks of uneven length, on the way to a goal that stands and to one nearer than the way to stop."""
     pose = Pose(0.0, 100.0, 100.0, 50.0)
+    regulated = FIGURES | {"rotation": replace(FIGURES["rotation"], profile_in_device=False)}
     for goal_deg, pattern in product((35.0, -12.0, 0.4), ((0.02, 0.2), (0.001, 0.08, 0.02), (0.2,), (0.02, 0.021))):
         state, rows = GateState(), []
         for tick in range(60):
-            inputs = GateInputs(GATE, FIGURES, Mode.MANUAL, pose, pattern[tick % len(pattern)], True)
+            inputs = GateInputs(GATE, regulated, Mode.MANUAL, pose, pattern[tick % len(pattern)], True)
             state, passed = pass_gate(state, Goals(goal_deg), inputs)
             rows.append(passed["rotation"].limited)
         yield f"to {goal_deg} with ticks of {pattern}", plain(rows)

@@ -19,9 +19,13 @@ from graderd.core.machine import ARMED, Inputs, Lease, MachineSettings, Mode, St
 from graderd.core.rule import Decision, RuleSettings
 from graderd.core.soil import SoilObservation, Zone
 
+pytestmark = pytest.mark.xdist_group("core machine model")  # the reachable states are found once
+
 TICK_S = 0.1
 SETTINGS = MachineSettings(arm_timeout_s=0.25, lease_s=0.15)
-RULE = RuleSettings(votes_needed_n=2, votes_window_n=2, dwell_s=0.25, vote_max_age_s=0.25, switch_share=0.5)
+RULE = RuleSettings(
+    votes_needed_n=2, votes_window_n=2, dwell_s=0.25, vote_max_age_s=0.25, switch_share=0.5, pass_s=0.35
+)
 HORIZON_S = 0.4
 NOW_S = 100.0
 
@@ -152,6 +156,7 @@ def test_it_is_a_real_search(model: Model) -> None:
     assert any(state.lease for state in model.edges)
     assert any(state.later for state in model.edges)
     assert {state.decision.zone for state in model.edges} >= {None, Zone.LEFT, Zone.RIGHT}
+    assert {state.decision.kept for state in model.edges} == {True, False}
 
 
 def test_never_motion_when_stopped_or_disarmed(model: Model) -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graderd.core.rule import Decision, RuleSettings, decide
-from graderd.core.soil import SoilObservation, Zone
+from graderd.core.rule import Decision, RuleSettings, Travel, decide
+from graderd.core.soil import SoilAhead, SoilObservation, Thirds, Zone
 
 RULE = RuleSettings()
+STANDING = Travel(0.0, 0.0)
+SPREAD = (12.0, 20.0, 12.0)
+"""A carried heap, litres, spread over the whole blade as every heap is within a metre."""
 SHARES = {
     Zone.LEFT: (0.8, 0.15, 0.05),
     Zone.CENTER: (0.1, 0.8, 0.1),
@@ -27,12 +31,59 @@ def seen(zone: Zone, capture_s: float, confidence: float = 0.9, shares: tuple[fl
     return SoilObservation(capture_s, zone, confidence, "", left, center, right)
 
 
-def run(zones: list[Zone], start: Decision | None = None, start_s: float = 100.0, step_s: float = 0.066) -> Decision:
+def apart(ahead: Zone, carried: tuple[float, float, float], capture_s: float) -> SoilObservation:
+    """Soil of which the method could tell what lies ahead; ``zone`` is what all of it looks like together."""
+    litres = Thirds(*(20.0 * share for share in SHARES[ahead]))
+    both = {
+        Zone.LEFT: litres.left + carried[0],
+        Zone.CENTER: litres.center + carried[1],
+        Zone.RIGHT: litres.right + carried[2],
+    }
+    total = sum(both.values())
+    zone = (
+        Zone.NONE if total < 1.0 else Zone.EVEN if min(both.values()) > 0.2 * total else max(both, key=both.__getitem__)
+    )
+    return replace(seen(zone, capture_s), ahead=SoilAhead(ahead, 0.9, "", litres), carried=Thirds(*carried))
+
+
+def run(
+    zones: list[Zone],
+    start: Decision | None = None,
+    start_s: float = 100.0,
+    step_s: float = 0.066,
+    travel: Travel | None = STANDING,
+) -> Decision:
     decision = start or Decision()
     for index, zone in enumerate(zones):
         now_s = start_s + index * step_s
-        decision = decide(decision, seen(zone, now_s), settled=True, now_s=now_s, rule=RULE)
+        decision = decide(decision, seen(zone, now_s), settled=True, now_s=now_s, rule=RULE, travel=travel)
     return decision
+
+
+def drive(
+    decision: Decision,
+    ahead: Zone,
+    carried: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    metres: float = 1.0,
+    speed: float = 0.5,
+    at: tuple[float, float] = (100.0, 0.0),
+) -> tuple[Decision, tuple[float, float]]:
+    """Drive so far with this before the blade, a picture every 66 ms; returns the decision and (time, travel) then."""
+    now_s, travelled_m = at
+    for _ in range(round(metres / speed / 0.066)):
+        now_s, travelled_m = now_s + 0.066, travelled_m + 0.066 * speed
+        decision = decide(decision, apart(ahead, carried, now_s), True, now_s, RULE, Travel(speed, travelled_m))
+    return decision, (now_s, travelled_m)
+
+
+def stand(
+    decision: Decision, ahead: Zone, at: tuple[float, float], seconds: float
+) -> tuple[Decision, tuple[float, float]]:
+    now_s, travelled_m = at
+    for _ in range(round(seconds / 0.066)):
+        now_s += 0.066
+        decision = decide(decision, apart(ahead, (0, 0, 0), now_s), True, now_s, RULE, Travel(0.0, travelled_m))
+    return decision, (now_s, travelled_m)
 
 
 @pytest.mark.parametrize(
@@ -92,20 +143,25 @@ def test_a_change_needs_a_clear_share() -> None:
     decision = first
     for index in range(10):
         at_s = now_s + index * 0.066
-        decision = decide(decision, seen(Zone.CENTER, at_s, shares=(0.35, 0.6, 0.05)), True, at_s, RULE)
+        decision = decide(decision, seen(Zone.CENTER, at_s, shares=(0.35, 0.6, 0.05)), True, at_s, RULE, STANDING)
     assert decision.zone is Zone.LEFT
     for index in range(10):
         at_s = now_s + 2 + index * 0.066
-        decision = decide(decision, seen(Zone.CENTER, at_s, shares=(0.15, 0.8, 0.05)), True, at_s, RULE)
+        decision = decide(decision, seen(Zone.CENTER, at_s, shares=(0.15, 0.8, 0.05)), True, at_s, RULE, STANDING)
     assert decision.zone is Zone.CENTER
 
 
-@given(st.lists(st.sampled_from(list(Zone)), min_size=1, max_size=300))
-def test_never_more_often_than_the_dwell_allows(zones: list[Zone]) -> None:
-    decision, times = Decision(), []
-    for index, zone in enumerate(zones):
+SPEEDS = st.sampled_from([None, -0.3, 0.0, 0.3])
+
+
+@given(st.lists(st.tuples(st.sampled_from(list(Zone)), SPEEDS), min_size=1, max_size=300))
+def test_never_more_often_than_the_dwell_allows(told: list[tuple[Zone, float | None]]) -> None:
+    decision, times, travelled_m = Decision(), [], 0.0
+    for index, (zone, speed) in enumerate(told):
         now_s = index * 0.066
-        new = decide(decision, seen(zone, now_s, shares=(1.0, 1.0, 1.0)), True, now_s, RULE)
+        travelled_m += 0.066 * (speed or 0.0)
+        travel = None if speed is None else Travel(speed, travelled_m)
+        new = decide(decision, seen(zone, now_s, shares=(1.0, 1.0, 1.0)), True, now_s, RULE, travel)
         if new.zone is not decision.zone:
             times.append(now_s)
         decision = new
@@ -115,3 +171,105 @@ def test_never_more_often_than_the_dwell_allows(zones: list[Zone]) -> None:
 def test_more_votes_needed_than_kept_is_refused() -> None:
     with pytest.raises(ValueError, match="votes_needed_n"):
         RuleSettings(votes_needed_n=7, votes_window_n=6)
+
+
+# ---- one decision a pass --------------------------------------------------------------------------------------------
+
+
+def test_what_the_blade_carries_does_not_undo_the_decision_of_the_pass() -> None:
+    """A center pile ended at 45 degrees: carried it spreads over the blade and looks even."""
+    decision, at = drive(Decision(), Zone.CENTER)
+    assert (decision.zone, decision.angle_deg, decision.kept) == (Zone.CENTER, 15.0, True)
+    assert apart(Zone.NONE, SPREAD, 0.0).zone is Zone.EVEN
+    decision, at = drive(decision, Zone.NONE, SPREAD, metres=3.0, at=at)
+    assert (decision.zone, decision.angle_deg) == (Zone.CENTER, 15.0)
+    assert decision.reason(at[0]) == "center, kept for this pass since 3.9 m"
+
+
+def test_another_heap_ahead_does_not_turn_the_blade_in_mid_pass() -> None:
+    decision, at = drive(Decision(), Zone.LEFT)
+    decision, at = drive(decision, Zone.RIGHT, (20.0, 5.0, 0.0), metres=4.0, at=at)
+    assert decision.zone is Zone.LEFT
+
+
+def test_even_follows_on_soil_ahead_that_lies_evenly_and_then_stays() -> None:
+    decision, at = drive(Decision(), Zone.LEFT)
+    decision, at = drive(decision, Zone.EVEN, (20.0, 5.0, 0.0), at=at)
+    assert (decision.zone, decision.angle_deg) == (Zone.EVEN, 45.0)
+    decision, at = drive(decision, Zone.RIGHT, SPREAD, metres=4.0, at=at)
+    assert decision.zone is Zone.EVEN
+
+
+def test_even_by_a_method_that_cannot_tell_what_is_carried_follows_on_nothing() -> None:
+    for travel in (None, STANDING, Travel(0.5, 3.0)):
+        first = run([Zone.CENTER] * 6, travel=travel)
+        assert run([Zone.EVEN] * 20, first, first.decided_s + 5.0, travel=travel).zone is Zone.CENTER
+
+
+def test_the_pass_ends_when_the_machine_stands() -> None:
+    decision, at = drive(Decision(), Zone.LEFT)
+    decision, at = stand(decision, Zone.LEFT, at, RULE.standing_s - 0.1)
+    assert decision.kept
+    decision, at = stand(decision, Zone.NONE, at, 0.3)
+    assert not decision.kept
+    assert decision.reason(at[0]) == "left, until the next pass: the machine stands"
+    assert decision.angle_deg == 30.0  # held until there is another decision
+    decision, at = drive(decision, Zone.RIGHT, at=at)
+    assert (decision.zone, decision.kept) == (Zone.RIGHT, True)
+
+
+def test_a_machine_that_has_not_started_yet_does_not_end_the_pass_by_standing() -> None:
+    decision, at = stand(Decision(), Zone.LEFT, (100.0, 0.0), 5.0)
+    assert decision.kept
+    assert decision.reason(at[0]) == "left, before the pass"
+
+
+def test_the_pass_ends_when_the_machine_reverses() -> None:
+    decision, at = drive(Decision(), Zone.LEFT)
+    decision = decide(decision, None, True, at[0] + 0.02, RULE, Travel(-0.2, at[1]))
+    assert (decision.kept, decision.ended) == (False, "the machine reversed")
+
+
+def test_the_pass_ends_when_the_soil_is_gone_and_not_while_some_is_carried() -> None:
+    decision, at = drive(Decision(), Zone.LEFT)
+    decision, at = drive(decision, Zone.NONE, SPREAD, at=at)
+    assert decision.kept
+    decision, at = drive(decision, Zone.NONE, at=at)
+    assert decision.ended == "the soil is gone"
+    decision, at = drive(decision, Zone.RIGHT, at=at)
+    assert decision.zone is Zone.RIGHT
+
+
+def test_the_pass_ends_after_the_configured_travel() -> None:
+    decision, at = drive(Decision(), Zone.LEFT, metres=RULE.pass_m + 0.05)
+    assert decision.kept
+    decision, at = drive(decision, Zone.UNKNOWN, metres=0.3, at=at)
+    assert decision.ended == "10 m were travelled"
+
+
+def test_without_speed_the_time_counts() -> None:
+    first = run([Zone.LEFT] * 6, travel=None)
+    assert first.reason(first.decided_s + 4.0) == "left, kept for this pass since 4.0 s"
+    later = run([Zone.RIGHT] * 20, first, first.decided_s + RULE.pass_s - 2.0, travel=None)
+    assert later.zone is Zone.LEFT
+    later = run([Zone.RIGHT] * 20, first, first.decided_s + RULE.pass_s, travel=None)
+    assert later.zone is Zone.RIGHT
+
+
+def test_a_speed_that_is_lost_in_mid_pass_keeps_the_decision() -> None:
+    decision, at = drive(Decision(), Zone.LEFT)
+    now_s = at[0]
+    for _ in range(100):
+        now_s += 0.066
+        decision = decide(decision, apart(Zone.RIGHT, SPREAD, now_s), True, now_s, RULE, None)
+    assert decision.zone is Zone.LEFT
+    # Back again, counting from somewhere else: the pass goes on from here.
+    decision = decide(decision, None, True, now_s + 0.02, RULE, Travel(0.5, 0.0))
+    assert (decision.kept, decision.since_m) == (True, 0.0)
+
+
+def test_the_swing_of_the_blade_does_not_hide_the_end_of_the_pass() -> None:
+    decision, at = drive(Decision(), Zone.LEFT)
+    for number in range(60):
+        decision = decide(decision, None, False, at[0] + number * 0.02, RULE, Travel(0.0, at[1]))
+    assert decision.ended == "the machine stands"

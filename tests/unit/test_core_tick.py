@@ -34,6 +34,7 @@ from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry
+from graderd.hal.vehicle import VehicleTelemetry
 from graderd.runtime.control import ControlLoop, tick_settings
 from graderd.runtime.state_file import StateFile
 from tests.fakes import FakeMachine
@@ -66,6 +67,7 @@ def standing(
     }
 
 
+FASTEST = {"rotation": 25.0, "lift_left": 20.0, "lift_right": 20.0, "tilt": 15.0}
 HOME = {"rotation": 0.0, "lift_left": 100.0, "lift_right": 100.0, "tilt": 50.0}
 
 
@@ -104,7 +106,8 @@ def stretch_of_work() -> list[Sensed]:
             for axis, decided in tick.axes.items()
             if decided.send is not None or (axis in goals and not decided.hold)
         }
-        at |= goals
+        for axis, goal in goals.items():
+            at[axis] += max(-FASTEST[axis] * TICK_S, min(goal - at[axis], FASTEST[axis] * TICK_S))
         found.append(sensed)
     return found
 
@@ -247,6 +250,22 @@ async def test_each_device_is_asked_once_a_tick_and_readiness_is_made_once(
     loop.turn()
     assert asked == Counter({**dict.fromkeys(AXES, 1), "requirements": 1})
     await loop._power.close()
+
+
+@pytest.mark.parametrize(("age_s", "since_m"), [(0.1, 0.0), (0.6, None)])
+def test_an_old_speed_is_none(age_s: float, since_m: float | None) -> None:
+    """Then the time counts, not the travel."""
+    controller, step = Controller(SETTINGS), partial(Sensed, powered=True)
+    controller.step(Sensed(1.0, standing(1.0, HOME, Lifecycle.STANDBY), commands=(cmd.Arm(),)))
+    for number in range(1, 50):
+        now_s = 1.0 + TICK_S * number
+        seen = SoilObservation(now_s, Zone.LEFT, 0.9, "", 0.8, 0.15, 0.05)
+        vehicle = VehicleTelemetry(Reading(0.5, now_s - age_s), Reading(7.0, now_s - age_s))
+        commands = (cmd.Auto(),) if number == 2 else ()
+        tick = controller.step(step(now_s, standing(now_s, HOME), commands=commands, observation=seen, vehicle=vehicle))
+        if tick.state.decision.zone is not None:
+            break
+    assert (tick.state.decision.zone, tick.state.decision.since_m) == (Zone.LEFT, since_m)
 
 
 def test_nobody_but_the_tick_calls_what_it_decides_with() -> None:

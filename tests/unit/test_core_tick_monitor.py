@@ -17,6 +17,7 @@ import pytest
 
 from graderd.config import Config
 from graderd.core import commands as cmd
+from graderd.core.attitude import Preset
 from graderd.core.axes import ACTUATORS, AXES, JOG_AXES, LIFTS, PARTS
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import Reaction
@@ -76,8 +77,9 @@ class Monitor:
                 assert decided.hold, f"{axis} was not told to hold"
             if decided.send is not None:
                 self._judge(axis, decided, sensed, measured[axis], held, dt_s)
-        if self.lease is not None and any(axis in held or measured[axis] is None for axis in self.asked):
-            self.void = True
+        if self.lease is not None:
+            going = (axis for axis in AXES if tick.axes[axis].requested is not None)
+            self.void = any(axis in held or measured[axis] is None for axis in going)
         if self.armed:
             for axis, position in measured.items():
                 if position is not None and math.isfinite(position):
@@ -126,7 +128,7 @@ class Monitor:
                     self.lease = (command.client, sensed.now_s + CONFIG.machine.lease_s)
                     self.auto = False
                 case cmd.Preset():
-                    self.asked = frozenset(AXES)
+                    self.asked = moved_by(CONFIG.presets[command.name])
                     self.lease = (command.client, sensed.now_s + CONFIG.machine.lease_s)
                     self.auto = False
                 case cmd.Renew():
@@ -185,6 +187,16 @@ class Monitor:
         assert abs(send - last) <= figures.speed * min(dt_s, LATE_S) + EPS or nearer, (
             f"{axis} jumps from {last} to {send}"
         )
+
+
+def moved_by(preset: Preset) -> frozenset[str]:
+    """Axes that a preset may move."""
+    named = {
+        "rotation": preset.rotation_deg is not None,
+        **dict.fromkeys(LIFTS, preset.height_mm is not None or preset.slope_deg is not None),
+        "tilt": preset.pitch_deg is not None,
+    }
+    return frozenset(axis for axis, moves in named.items() if moves)
 
 
 def fresh(sensed: Sensed, axis: str) -> float | None:

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from graderd.drivers.electrak import safe_off
+from graderd.drivers.electrak.codec import ElectrakCodec
 from graderd.drivers.electrak.planner import Motion, MotionPlanner, Phase
 from graderd.drivers.electrak.profile import load_profile
 from graderd.drivers.electrak.thermal import DERATE_FROM, OverloadPolicy, ThermalGuard, Verdict
 from graderd.drivers.j1939.bus_health import BusEvent, BusHealth
+from graderd.drivers.j1939.can_port import PortFullError
+from graderd.drivers.j1939.ids import Frame, Pgn, destination_of, pgn_of
 from graderd.drivers.j1939.ticker import Ticker
 from graderd.hal.errors import DeviceMissingError
+from graderd.hal.settings import CanSettings
 
 HD = load_profile("electrak_hd_b017").figures
 
@@ -132,6 +138,38 @@ def test_an_overload_while_nothing_was_commanded_latches_at_once() -> None:
 
 
 # -- bus health -------------------------------------------------------------------------------------------------------
+
+
+class SlowPort:
+    """A CAN port whose queue is full for the first frames to one actuator."""
+
+    def __init__(self, deaf: int, full_n: int) -> None:
+        self.sent: list[Frame] = []
+        self.closed = False
+        self._deaf, self._full_n = deaf, full_n
+
+    def send(self, frame: Frame) -> None:
+        if destination_of(frame.can_id) == self._deaf and self._full_n:
+            self._full_n -= 1
+            raise PortFullError("its queue is full")
+        self.sent.append(frame)
+
+    def wait_ready(self, _: float) -> bool:
+        return True
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_the_last_words_are_said_again_to_whom_a_full_queue_kept_from_hearing(monkeypatch: pytest.MonkeyPatch) -> None:
+    port = SlowPort(deaf=20, full_n=3)
+    monkeypatch.setattr(sys.modules[safe_off.__module__], "open_port", lambda _: port)
+    assert safe_off(CanSettings(), (19, 20, 27)) == 9
+    codec = ElectrakCodec("electrak_hd")
+    told = [destination_of(f.can_id) for f in port.sent if pgn_of(f.can_id) == Pgn.PROPRIETARY_A]
+    assert set(told) == {19, 20, 27}
+    assert not any(codec.decode_control(f.data).motion_enable for f in port.sent[1:])
+    assert port.closed
 
 
 def test_an_interface_that_came_back_down_is_not_called_unplugged() -> None:

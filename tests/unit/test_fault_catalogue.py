@@ -32,7 +32,7 @@ CONDITIONS = {
         "alert_electrical_shock alert_overload watchdog_tripped ram_reset turns_lost torque_off not_moving "
         "not_arriving overspeed moving_uncommanded wrong_way voltage_near_limit temperature_near_limit unplugged"
     ),
-    "servo_bus": "adapter_latency",
+    "servo_bus": "adapter_latency lossy",
     "actuator": (
         "no_feedback implausible_feedback feedback_flood overload parameter saturation backdrive fatal voltage "
         "temperature uncommanded_motion not_moving not_arriving overspeed restarted wrong_address thermal_derating "
@@ -170,7 +170,7 @@ def test_a_fault_counts_after_its_debounce_and_ends_as_the_row_says(row: FaultRo
         ("lift_left.overload", {"actuator.overload"}),
         ("actuator.overload", {"actuator.overload"}),
         ("not_moving", {"rotation.not_moving", "actuator.not_moving"}),
-        ("servo_bus", {"servo_bus.adapter_latency"}),
+        ("servo_bus", {"servo_bus.adapter_latency", "servo_bus.lossy"}),
         ("tilt", {key for key in CATALOGUE if key.startswith("actuator.")}),
         ("tilt.stale", set()),
         ("nonsense", set()),
@@ -189,3 +189,32 @@ def test_the_three_actuators_share_their_rows() -> None:
 def test_the_pages_are_up_to_date(name: str) -> None:
     page = ROOT / "docs" / "operators" / name
     assert page.read_text("utf-8") == pages()[name], "write it again: python -m graderd.cli.docs"
+
+
+def _told_after_s(there_s: float, gone_s: float, row: FaultRow, tick_s: float = 0.02, most_s: float = 30.0) -> float:
+    """When a fault that is there and gone in turn is told first; infinite: not within ``most_s``."""
+    state, fault = FaultState(), DeviceFault("can", "bus", "", 0.0)
+    there_n, gone_n = round(there_s / tick_s), round(gone_s / tick_s)
+    for n in range(round(most_s / tick_s)):
+        now_s = n * tick_s
+        present = [fault] if n % (there_n + gone_n) < there_n else []
+        state = update_faults(state, present, now_s, {"can.bus": row})
+        if state.active:
+            return now_s
+    return float("inf")
+
+
+@pytest.mark.parametrize("debounce_s", [0.1, 0.3, 1.0])
+def test_a_fault_that_flaps_faster_than_its_debounce_is_told(debounce_s: float) -> None:
+    row = FaultRow("can.bus", "reads so", "for a cause", "with a remedy", Reaction.HOLD, debounce_s=debounce_s)
+    assert _told_after_s(60.0, 1.0, row) == pytest.approx(debounce_s, abs=0.02)
+    assert _told_after_s(0.02, 0.02, row) <= 3 * debounce_s + 0.1
+    assert _told_after_s(debounce_s * 0.8, debounce_s * 0.8, row) <= 5 * debounce_s
+    assert _told_after_s(debounce_s * 0.4, debounce_s * 0.8, row) <= 10 * debounce_s
+
+
+@pytest.mark.parametrize("debounce_s", [0.1, 0.3, 1.0])
+def test_what_is_there_for_a_moment_now_and_then_is_not_told(debounce_s: float) -> None:
+    row = FaultRow("can.bus", "reads so", "for a cause", "with a remedy", Reaction.HOLD, debounce_s=debounce_s)
+    assert _told_after_s(0.02, 0.2, row) == float("inf")
+    assert _told_after_s(debounce_s * 0.5, debounce_s * 2.0, row) == float("inf")

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.live
+
 SETUP = Path(__file__).parents[2] / "hil" / "setup"
 KERNEL = "6.1.99"
 

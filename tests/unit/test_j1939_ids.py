@@ -1,4 +1,4 @@
-"""29-bit identifiers and NAMEs: the standard's rules, and can-j1939 as an oracle."""
+"""29-bit identifiers and NAMEs: the standard's rules, and python-can-j1939 as an oracle."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_every_identifier_survives_the_round_trip(can_id: int) -> None:
 
 
 @given(st.integers(0, 0x1FFFFFFF))
-def test_identifiers_agree_with_can_j1939(can_id: int) -> None:
+def test_identifiers_agree_with_python_can_j1939(can_id: int) -> None:
     oracle = j1939.MessageId(can_id=can_id)
     pgn = j1939.ParameterGroupNumber()
     pgn.from_message_id(oracle)
@@ -96,7 +96,7 @@ names = st.builds(
 
 
 @given(names)
-def test_names_survive_the_round_trip_and_agree_with_can_j1939(name: Name) -> None:
+def test_names_survive_the_round_trip_and_agree_with_python_can_j1939(name: Name) -> None:
     assert Name.from_bytes(name.to_bytes()) == name
     oracle = j1939.Name(
         identity_number=name.identity,

@@ -8,6 +8,8 @@ import pytest
 
 import tests.conftest
 
+pytestmark = pytest.mark.live
+
 pytest_plugins = ["pytester"]
 
 CONFTEST = Path(tests.conftest.__file__).read_text(encoding="utf-8")

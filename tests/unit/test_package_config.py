@@ -89,6 +89,7 @@ def test_steps_run_in_order_up_to_the_present_version() -> None:
     assert changes == ["a.x is now b.x", "b.x is now b.y_deg"]
 
 
+@pytest.mark.live
 def test_the_installed_file_names_every_key_and_gives_the_defaults(tmp_path: Path) -> None:
     path = tmp_path / "graderd.toml"
     subprocess.run([sys.executable, PROJECT / "packaging" / "config_template.py", path], check=True)

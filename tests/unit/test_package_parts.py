@@ -73,6 +73,7 @@ def bytecode(action: str, prefix: Path) -> int:
     return subprocess.run([sys.executable, "-I", BYTECODE, action, prefix], check=False).returncode
 
 
+@pytest.mark.live
 def test_byte_code_is_made_for_this_python_kept_and_taken_away(tmp_path: Path) -> None:
     prefix = tree(tmp_path)
     foreign = prefix / "lib/common/package/__pycache__/module.cpython-399.pyc"
@@ -94,12 +95,14 @@ def test_byte_code_is_made_for_this_python_kept_and_taken_away(tmp_path: Path) -
     assert not list(prefix.rglob("__pycache__"))
 
 
+@pytest.mark.live
 def test_byte_code_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     prefix = tree(tmp_path)
     (prefix / "lib/common/package/__pycache__").write_text("in the way", encoding="utf-8")
     assert bytecode("make", prefix) == 1
 
 
+@pytest.mark.live
 def test_installing_asks_anew_only_for_devices_the_rules_are_about(tmp_path: Path) -> None:
     """By the function of the script itself, with a udevadm that writes down what it is asked."""
     function = re.search(

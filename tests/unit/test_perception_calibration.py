@@ -32,6 +32,8 @@ from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.soil import SoilField
 from harness.perception_scenes import Scene, render
 
+pytestmark = pytest.mark.slow
+
 NOMINAL = CameraCalibration()
 POSE_HERE = {
     "position_x_m": 0.84,

@@ -22,6 +22,8 @@ from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.blade import volumes_in_front_m3
 from graderd.simulator.scenes import label_of, random_scene
 
+pytestmark = pytest.mark.xdist_group("rig dataset")  # one set of pictures for all
+
 SCENES = 6
 
 
@@ -153,6 +155,7 @@ def test_rig_set_depth_shows_the_volumes_it_is_labelled_with() -> None:
     assert checked >= 2
 
 
+@pytest.mark.live
 def test_rig_set_is_not_overwritten_and_bad_arguments_are_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
+import select
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +21,7 @@ import pytest
 from graderd.hal.clock import SystemClock
 from graderd.runtime.app import journal
 from graderd.runtime.app.hang_watch import ARM_EVERY_S, HANGS_S, HangWatch
-from graderd.runtime.app.journal import JournalHandler, journal_entry, set_up_logging
+from graderd.runtime.app.journal import LATER_MOST_N, JournalHandler, journal_entry, set_up_logging
 
 FORGED = "person\nPRIORITY=0\n<0>2026-01-01 ERROR forged\x1b[2J"
 
@@ -59,6 +62,7 @@ def fields(datagram: bytes) -> dict[str, str]:
     ("level", "priority"),
     [(logging.DEBUG, "7"), (logging.INFO, "6"), (logging.WARNING, "4"), (logging.ERROR, "3"), (logging.CRITICAL, "2")],
 )
+@pytest.mark.live
 def test_the_journal_gets_priority_and_fields(tmp_path: Path, level: int, priority: str) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
         listener.bind(str(tmp_path / "journal"))
@@ -83,6 +87,7 @@ def test_a_traceback_stays_one_entry() -> None:
     assert got["PRIORITY"] == "3"
 
 
+@pytest.mark.live
 def test_what_the_journal_does_not_take_is_written_all_the_same(tmp_path: Path) -> None:
     kept: list[str] = []
 
@@ -121,10 +126,12 @@ def logged(code: str, *, in_journal: bool, address: Path) -> str:
 WARN = 'logging.getLogger("graderd.x").warning("a\\nb", extra={"device": "can"})'
 
 
+@pytest.mark.live
 def test_in_the_journal_without_its_socket_each_line_carries_its_priority(tmp_path: Path) -> None:
     assert logged(WARN, in_journal=True, address=tmp_path / "none") == "<4>a\\nb\n"
 
 
+@pytest.mark.live
 def test_in_the_journal_entries_go_to_its_socket(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
         listener.bind(str(tmp_path / "journal"))
@@ -132,6 +139,7 @@ def test_in_the_journal_entries_go_to_its_socket(tmp_path: Path) -> None:
         assert fields(listener.recv(65536))["GRADERD_DEVICE"] == "can"
 
 
+@pytest.mark.live
 def test_elsewhere_a_line_carries_the_time_and_no_priority(tmp_path: Path) -> None:
     printed = logged(WARN, in_journal=False, address=tmp_path / "none")
     assert printed.endswith(" WARNING a\\nb\n")
@@ -143,6 +151,7 @@ def test_json_lines_carry_the_fields(capsys: pytest.CaptureFixture[str]) -> None
     logging.getLogger("graderd.x").warning("%s", FORGED, extra={"device": "can", "fault": "can.unplugged"})
     logging.getLogger("graderd.x").warning("%s", FORGED, extra={"device": "can", "fault": "can.unplugged"})
     logging.getLogger("numexpr").info("said by a library")
+    logging.getLogger().handlers[0].close()
     (line,) = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     assert line["message"] == FORGED
     assert (line["level"], line["device"], line["fault"]) == ("warning", "can", "can.unplugged")
@@ -175,6 +184,7 @@ somewhere_deep()
         ("import os, signal; os.kill(os.getpid(), signal.SIGABRT)", "Fatal Python error: Aborted"),
     ],
 )
+@pytest.mark.live
 def test_where_the_loop_hangs_is_told(hang: str, said: str) -> None:
     done = subprocess.run(
         [sys.executable, "-c", HANGING.format(hang=hang)], capture_output=True, text=True, timeout=60, check=False
@@ -196,8 +206,82 @@ def test_a_loop_that_ticks_is_not_told_of_and_its_ticks_cost_little(capfd: pytes
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.parametrize(
+    ("level", "told"),
+    [
+        (logging.DEBUG, ["d", "i", "w", "e", "library w", "library e"]),
+        (logging.INFO, ["i", "w", "e", "library w", "library e"]),
+        (logging.WARNING, ["w", "e", "library w", "library e"]),
+        (logging.ERROR, ["e", "library e"]),
+    ],
+)
+def test_the_level_is_of_our_own_entries_and_libraries_stay_quiet(
+    level: int, told: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    set_up_logging(as_json=True, level=level)
+    for name, prefix in (("graderd.x", ""), ("numexpr", "library ")):
+        for at in (logging.DEBUG, logging.INFO, logging.WARNING, logging.ERROR):
+            logging.getLogger(name).log(at, "%s%s", prefix, logging.getLevelName(at)[0].lower())
+    assert [json.loads(line)["message"] for line in capsys.readouterr().err.splitlines()] == told
+
+
 def test_every_logger_of_ours_is_told_at_info() -> None:
     set_up_logging(as_json=False)
     assert logging.getLogger("graderd.drivers.dynamixel.servo_task").isEnabledFor(logging.INFO)
     assert not logging.getLogger("numexpr").isEnabledFor(logging.INFO)
     assert journal.priority(logging.INFO) == 6
+
+
+def test_a_pipe_that_nobody_reads_is_not_waited_for_and_what_was_lost_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    with os.fdopen(reading, "rb", buffering=0) as reader, os.fdopen(writing, "w") as stderr:
+        monkeypatch.setattr(sys, "stderr", stderr)
+        fill(writing)
+        set_up_logging(as_json=False)
+        handler = logging.getLogger().handlers[0]
+        for one in list(handler.filters):
+            handler.removeFilter(one)  # repetitions are held back before they come so far
+        log = logging.getLogger("graderd.test")
+        began_s = time.monotonic()
+        many_n = LATER_MOST_N + 100
+        for number in range(many_n):
+            log.warning("line %d", number)
+        assert time.monotonic() - began_s < 2.0
+        closing = threading.Thread(target=handler.close)
+        text = b""
+        while b"were lost" not in text or not text.endswith(b"\n"):
+            text += reader.read(65536)
+            log.warning("after")
+        told = int(re.search(rb"(\d+) lines of this log were lost", text)[1])  # type: ignore[index]  # or it fails
+        assert many_n - LATER_MOST_N - 2 <= told <= many_n - LATER_MOST_N
+        os.set_blocking(reading, False)
+        closing.start()
+        while closing.is_alive():
+            select.select([reader], [], [], 0.01)
+            reader.read(65536)
+        closing.join()
+    logging.getLogger().handlers.clear()
+
+
+def test_a_process_whose_standard_error_nobody_reads_ends(tmp_path: Path) -> None:
+    del tmp_path
+    code = (
+        "import logging, os\nfrom graderd.runtime.app.journal import set_up_logging\n"
+        "os.set_blocking(2, False)\n"
+        "try:\n    while True: os.write(2, b'x' * 4096)\nexcept BlockingIOError: pass\n"
+        "os.set_blocking(2, True)\nset_up_logging(False)\nlogging.getLogger('graderd').error('one')\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE)
+    assert process.wait(20) == 0
+    assert process.stderr is not None
+    process.stderr.close()
+
+
+def fill(descriptor: int) -> None:
+    """Write until the pipe is full."""
+    os.set_blocking(descriptor, False)
+    try:
+        while True:
+            os.write(descriptor, b"x" * 4096)
+    except BlockingIOError:
+        os.set_blocking(descriptor, True)

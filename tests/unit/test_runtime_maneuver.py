@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from graderd.api.port import ServiceError
 from graderd.config import Config
 from graderd.core import commands as cmd
 from graderd.core.machine import Mode
 from graderd.hal.errors import DeviceLostError, DeviceRefusedError
 from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.service import DeviceService, NoArguments
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.maneuver import Maneuver
+from graderd.runtime.port import Port
 from graderd.runtime.state_file import StateFile
 from harness.awake_clock import AwakeClock
 from tests.fakes import FakeMachine
@@ -84,3 +88,62 @@ async def test_an_arming_that_fails_says_why(tmp_path: Path) -> None:
         with pytest.raises(DeviceRefusedError, match="limits did not read back"):
             await turn(loop, 5.0)
         assert machine.rotation.position == 0.0
+
+
+def port_of(machine: FakeMachine, loop: ControlLoop) -> Port:
+    """A port with one service, which turns to 40 degrees."""
+
+    async def turn_far(_: NoArguments) -> dict[str, Any]:
+        await turn(loop, 40.0)
+        return {}
+
+    services = {"rotation.turn": DeviceService(turn_far, moves=True), "rotation.other": DeviceService(turn_far)}
+    return Port(Config(), loop, machine.devices, machine.eyes, services)  # type: ignore[arg-type]  # eyes: not looked at
+
+
+async def until(reached: Callable[[], bool]) -> None:
+    async with asyncio.timeout(10.0):
+        while not reached():
+            await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize("begun", ["while it arms", "under way"])
+async def test_it_ends_with_the_client_that_asked(tmp_path: Path, begun: str) -> None:
+    async with running(tmp_path) as (machine, loop):
+        task = asyncio.create_task(port_of(machine, loop).service("rotation.turn", {"consent": True}))
+        if begun == "under way":
+            await until(lambda: machine.rotation.position > 2.0)
+        else:
+            await until(lambda: loop.tick.state.arming_since_s is not None)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        # It has said so to the machine before it ends: one tick.
+        assert loop.tick.state.mode is Mode.DISARMED
+        assert loop.tick.state.arming_since_s is None
+        stood_deg, since_s = machine.rotation.position, loop.tick.now_s
+        await until(lambda: loop.tick.now_s > since_s + 0.5)
+        assert machine.rotation.position == pytest.approx(stood_deg, abs=0.2)
+        assert loop.tick.state.mode is Mode.DISARMED
+
+
+async def test_one_at_a_time(tmp_path: Path) -> None:
+    async with running(tmp_path) as (machine, loop):
+        port = port_of(machine, loop)
+        first = asyncio.create_task(port.service("rotation.turn", {"consent": True}))
+        await asyncio.sleep(0)  # taken, and not armed yet: the machine's mode does not tell yet
+        for name in ("rotation.turn", "rotation.other"):
+            with pytest.raises(ServiceError, match=r"rotation\.turn is under way"):
+                await port.service(name, {"consent": True})
+        loop.stop_now(cmd.Stop(reason="enough"))
+        with pytest.raises(ServiceError):
+            await first
+        assert machine.rotation.position < 5.0
+
+
+@pytest.mark.parametrize("consent", ["false", "no", [0], -1, 1, 1.0, None])
+async def test_consent_is_true(tmp_path: Path, consent: Any) -> None:
+    async with running(tmp_path) as (machine, loop):
+        with pytest.raises(ServiceError, match="may move"):
+            await port_of(machine, loop).service("rotation.turn", {"consent": consent})
+        assert loop.tick.state.reason == "started disarmed"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import socket
 import time
 from pathlib import Path
@@ -12,12 +13,15 @@ import pytest
 
 from graderd.config import Config, parse
 from graderd.core.machine import Mode
-from graderd.core.status import FaultStatus, Status
+from graderd.core.soil import Zone
+from graderd.core.status import CameraStatus, FaultStatus, Status
 from graderd.runtime.app.perception_child import AngleHistory, settings_not_kept
 from graderd.runtime.health import HealthWatch
 from graderd.runtime.recorder import Recorder
 from graderd.runtime.sd_notify import SystemdNotifier
 from graderd.runtime.state_file import StateFile
+from graderd.runtime.status import build_status
+from tests.unit.test_runtime_control import Bench
 
 STATUS = Status(
     time_s=1.0, wall_time="2026-01-01T00:00:00Z", version="0", simulated=True, mode=Mode.DISARMED, reason="t"
@@ -25,7 +29,9 @@ STATUS = Status(
 
 
 def test_the_last_stop_survives_a_restart(tmp_path: Path) -> None:
-    StateFile(str(tmp_path / "new")).save("dog on the site")
+    state = StateFile(str(tmp_path / "new"))
+    state.save("dog on the site")
+    assert state.settle()
     found = StateFile(str(tmp_path / "new")).load()
     assert found is not None
     assert found.reason == "dog on the site"
@@ -44,6 +50,7 @@ def test_a_damaged_state_file_is_set_aside_and_told(tmp_path: Path, content: byt
     assert (tmp_path / "last_stop.damaged").read_bytes() == content
     assert not path.exists()
     state.save("next")
+    assert state.settle()
     assert state.problem == ""
 
 
@@ -51,9 +58,30 @@ def test_a_state_directory_that_cannot_be_written_is_told_and_raises_nothing(tmp
     (tmp_path / "file").write_text("", encoding="utf-8")
     state = StateFile(str(tmp_path / "file" / "state"))
     assert state.save("x").reason == "x"
+    assert state.settle()
     assert state.problem
 
 
+def test_a_state_directory_that_stalls_is_not_waited_for_and_told(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "last_stop.new")  # a file whose opening hangs, as on a disk that does not answer
+    state = StateFile(str(tmp_path))
+    began_s = time.monotonic()
+    for reason in ("one", "two", "three"):
+        assert state.save(reason).reason == reason
+    assert time.monotonic() - began_s < 0.1
+    assert not state.settle(0.05)
+    assert "takes long" in state.problem
+    with (tmp_path / "last_stop.new").open("rb"):  # the disk is back
+        assert state.settle()
+    assert state.problem == ""
+    state.save("four")
+    assert state.settle()
+    last = state.load()
+    assert last is not None
+    assert last.reason == "four"
+
+
+@pytest.mark.live
 def test_systemd_is_told_ready_status_watchdog_and_stopping(tmp_path: Path) -> None:
     path = tmp_path / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
@@ -267,3 +295,32 @@ def test_settings_the_camera_did_not_take_are_named() -> None:
     (wrong,) = settings_not_kept(camera, {"exposure_us": 8000.0, "white_balance_k": 5500.0})
     assert "white_balance_k" in wrong
     assert settings_not_kept(camera, {}) == ()
+
+
+class _Eyes:
+    """Its camera gives nothing any more."""
+
+    frames_per_s = 0.0
+
+    def status(self) -> CameraStatus:
+        return CameraStatus()
+
+
+async def test_what_is_past_its_age_is_told_as_unknown(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    await bench.ticks(5, zone=Zone.LEFT, share_left=1.0, volume_left_l=3.0)
+    told = build_status(Config(), bench.loop, _Eyes())  # type: ignore[arg-type]  # all that is asked of it
+    assert (told.soil.zone, told.soil.share_left, told.soil.volume_left_l) == (Zone.LEFT, 1.0, 3.0)
+    assert told.axes["rotation"].measured is not None
+    bench.machine.rotation.lose()
+    await bench.ticks(200)
+    told = build_status(Config(), bench.loop, _Eyes())  # type: ignore[arg-type]  # as above
+    assert (told.soil.zone, told.soil.confidence, told.soil.share_left, told.soil.volume_left_l) == (
+        Zone.UNKNOWN, 0.0, 0.0, None
+    )  # fmt: skip
+    assert told.soil.age_s is not None
+    assert told.soil.age_s > 3.0
+    lost = told.axes["rotation"]
+    assert (lost.measured, lost.velocity_per_s, lost.moving) == (None, None, None)
+    assert lost.measured_age_s is not None
+    assert lost.measured_age_s > 3.0

@@ -304,6 +304,7 @@ async def test_without_a_first_reading_it_soon_means_stop(tmp_path: Path) -> Non
     assert [fault.condition for fault in watch.faults(now_s + FIRST_WORD_S)] == ["lost"]
 
 
+@pytest.mark.live
 async def test_a_press_is_told_at_once_and_once_and_stands_until_released(tmp_path: Path) -> None:
     async with watching(tmp_path) as w:
         await w.permitted()
@@ -320,6 +321,7 @@ async def test_a_press_is_told_at_once_and_once_and_stands_until_released(tmp_pa
         await w.permitted()
 
 
+@pytest.mark.live
 async def test_a_lost_loop_is_told_and_found_again(tmp_path: Path) -> None:
     async with watching(tmp_path) as w:
         await w.permitted()
@@ -330,6 +332,7 @@ async def test_a_lost_loop_is_told_and_found_again(tmp_path: Path) -> None:
         await w.permitted()
 
 
+@pytest.mark.live
 async def test_a_short_circuit_is_found_by_the_test_pulse(tmp_path: Path) -> None:
     async with watching(tmp_path, test_every_s=0.05) as w:
         await w.permitted()
@@ -340,6 +343,7 @@ async def test_a_short_circuit_is_found_by_the_test_pulse(tmp_path: Path) -> Non
         await w.permitted()
 
 
+@pytest.mark.live
 async def test_a_port_that_blocks_is_stale_and_nothing_else_waits_for_it(tmp_path: Path) -> None:
     release = threading.Event()
 
@@ -359,6 +363,7 @@ async def test_a_port_that_blocks_is_stale_and_nothing_else_waits_for_it(tmp_pat
         await w.permitted()
 
 
+@pytest.mark.live
 async def test_a_silent_loop_is_stale_then_lost(tmp_path: Path) -> None:
     async with watching(tmp_path, stale_s=0.1) as w:
         await w.permitted()
@@ -433,6 +438,7 @@ class SimulatedStand(StopInputStand):
         self._events.close()
 
 
+@pytest.mark.live
 class TestSimulated(StopInputConformance):
     @pytest.fixture
     def stop_stand(self, tmp_path: Path) -> Iterator[SimulatedStand]:

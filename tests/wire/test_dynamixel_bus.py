@@ -163,9 +163,9 @@ async def test_many_tasks_share_the_wire_one_request_at_a_time(bus: ServoBus, se
     in_flight: list[int] = []
     transmit = bus._transmit
 
-    def watched(packet: bytes) -> None:
+    async def watched(packet: bytes) -> bool:
         in_flight.append(servos.requests_n - servos.replies_n)
-        transmit(packet)
+        return await transmit(packet)
 
     bus._transmit = watched  # type: ignore[method-assign]
     for servo in servos.servos:
@@ -205,7 +205,7 @@ async def test_a_cancelled_request_leaves_the_wire_usable(bus: ServoBus, servos:
 
 async def test_every_byte_is_logged(servos: VirtualServoBus) -> None:
     log: list[tuple[float, str, bytes]] = []
-    bus = ServoBus(str(servos.link), 57_600, bus_log=lambda t, d, b: log.append((t, d, b)))
+    bus = ServoBus(str(servos.link), 57_600, taps=[lambda t, d, b: log.append((t, d, b))])
     bus.open()
     await bus.ping(1)
     bus.close()

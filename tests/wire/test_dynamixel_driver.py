@@ -12,7 +12,7 @@ from graderd.drivers.dynamixel import Ph54Rotator, ServoBus
 from graderd.drivers.dynamixel.codec import Instruction, Packet, StatusError, StreamDecoder
 from graderd.drivers.dynamixel.device import Ph54Device
 from graderd.drivers.dynamixel.table import ControlTable
-from graderd.hal.errors import DeviceError, DeviceTimeoutError, LifecycleError
+from graderd.hal.errors import DeviceError, DeviceTimeoutError
 from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
@@ -48,7 +48,8 @@ async def tapped(tmp_path: Path, servo: VirtualServo, **changes: float) -> tuple
     wire = VirtualServoBus([servo], tmp_path / "servo", clock=clock)
     await wire.start()
     tap = Tap()
-    rotator = Ph54Rotator(Ph54Settings(**{"port": str(tmp_path / "servo"), **changes}), clock=clock, bus_log=tap)
+    rotator = Ph54Rotator(Ph54Settings(**{"port": str(tmp_path / "servo"), **changes}), clock=clock)
+    rotator.tap(tap)
     await rotator.open()
     return tap, rotator, wire
 
@@ -59,6 +60,24 @@ async def test_opening_writes_nothing_but_the_status_return_level(tmp_path: Path
     await rotator.close()
     await wire.close()
     assert tap.writes() == [(TABLE["status_return_level"].address, b"\x02")]
+
+
+async def test_a_tap_hears_every_connection_until_it_ends(tmp_path: Path) -> None:
+    tap, rotator, wire = await tapped(tmp_path, VirtualServo())
+    await wire.unplug()
+    await until(lambda: rotator.lifecycle is Lifecycle.FAILED, "not failed")
+    before_n = len(tap.sent)
+    await wire.replug()
+    await until(lambda: len(tap.sent) > before_n, "nothing of the new connection")
+    second = Tap()
+    end = rotator.tap(second)
+    await until(lambda: second.sent, "nothing heard")
+    end()
+    heard_n, before_n = len(second.sent), len(tap.sent)
+    await until(lambda: len(tap.sent) > before_n + 3, "the first hears no more")
+    assert len(second.sent) == heard_n
+    await rotator.close()
+    await wire.close()
 
 
 async def test_hold_is_the_very_next_packet(tmp_path: Path) -> None:
@@ -96,7 +115,7 @@ async def test_goals_are_sent_once_and_the_profile_only_after_a_hold(tmp_path: P
     goal_again = rotator.calibration.counts(6.0).to_bytes(4, "little", signed=True)
     await until(lambda: tap.writes(start)[-1][1].endswith(goal_again), "no goal after the hold")
     assert tap.writes(start)[-1][0] == PROFILE
-    assert held == 10 * int.from_bytes(tap.writes(start)[-1][1][:4], "little") == 6000
+    assert held == 10 * int.from_bytes(tap.writes(start)[-1][1][:4], "little") == 5000
     await rotator.close()
     await wire.close()
 
@@ -193,10 +212,11 @@ async def test_every_difference_is_listed_in_every_kind(tmp_path: Path) -> None:
         }
         assert "70" in found["temperature_limit"].text
         await rig.rotator.arm()
-        assert "current_limit" in {d.register for d in await rig.rotator.verify_profile()}
+        assert servo.memory["current_limit"] == 9300
         await rig.rotator.close()
-        with pytest.raises(LifecycleError):
-            await rig.rotator.verify_profile()
+        again = {d.register for d in await rig.rotator.verify_profile()}  # closed: the wire is taken for this alone
+        assert again == found.keys()  # what arming wrote is no difference
+        assert rig.rotator.port is None
 
 
 async def test_a_register_the_servo_does_not_know_is_a_difference(tmp_path: Path) -> None:
@@ -207,7 +227,7 @@ async def test_a_register_the_servo_does_not_know_is_a_difference(tmp_path: Path
     await wire.start()
     bus = ServoBus(str(tmp_path / "servo"), 57_600)
     bus.open()
-    (difference,) = await Ph54Device(bus, TABLE, 1).verify(3)
+    (difference,) = await Ph54Device(bus, TABLE, 1).verify(3, {})
     assert (difference.register, difference.kind, difference.device) == ("backup_ready", "refused", None)
     assert StatusError.ACCESS.name.lower() in difference.text
     bus.close()

@@ -1,4 +1,4 @@
-"""Both sides of the CAN wire against programs we did not write: python-can, cantools, can-j1939, the kernel's J1939."""
+"""Both sides of the CAN wire against what we did not write: python-can, cantools, python-can-j1939, the kernel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-import can
 import cantools.database
 import j1939
 import pytest
@@ -21,6 +20,7 @@ import pytest
 import graderd.firmware_profiles
 from graderd.drivers.electrak import CanLink, ElectrakActuator, safe_off
 from graderd.drivers.j1939.ids import Pgn
+from graderd.drivers.j1939.python_can import can
 from graderd.drivers.j1939.transport import Message
 from graderd.hal.errors import DeviceMissingError
 from graderd.hal.settings import CanSettings, ElectrakSettings
@@ -117,8 +117,8 @@ def test_safe_off_on_a_missing_bus_says_so(tmp_path: Path) -> None:
         safe_off(CanSettings(interface="slcan", channel=str(tmp_path / "none")), (19,))
 
 
-async def test_can_j1939_claims_requests_and_sends_long_messages_beside_us(tmp_path: Path) -> None:
-    """can-j1939 as a neighbour: it sees our claim, we keep our address, transport protocol works both ways."""
+async def test_python_can_j1939_claims_requests_and_sends_long_messages_beside_us(tmp_path: Path) -> None:
+    """python-can-j1939 as a neighbour: it sees our claim, we keep our address, transport protocol works both ways."""
     channel = f"neighbour-{os.getpid()}-{tmp_path.name}"
     link = CanLink(CanSettings(interface="virtual", channel=channel), software="graderd test")
     long_messages: list[Message] = []

@@ -9,6 +9,8 @@ from enum import IntEnum, StrEnum
 from graderd.core.axes import ACTUATORS, PARTS
 from graderd.hal.fault import DeviceFault
 
+GONE_COUNTS = 3.0
+ROUNDING_S = 1e-9
 ALL_AXES = frozenset(PARTS.values())
 
 
@@ -70,10 +72,27 @@ def catalogue_key(device: str, condition: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class FaultState:
-    """Memory of the fault monitor between ticks: when each was first seen, and the ones that are latched."""
+class Seen:
+    """What speaks for a fault that may not count yet: since when it comes (and goes), and for how long it was there.
+    Time without it counts against it, at a third: one that flaps faster than its debounce is told all the same, and
+    one that was there for a moment is forgotten."""
 
-    first_seen_s: Mapping[str, float] = field(default_factory=dict)
+    first_s: float
+    there_s: float = 0.0
+    now: bool = False
+
+    def at(self, later_s: float) -> Seen | None:
+        """The same so much later; None: nothing speaks for it any more."""
+        there_s = self.there_s + (later_s if self.now else -later_s / GONE_COUNTS)
+        return Seen(self.first_s, there_s) if self.now or there_s > 0.0 else None
+
+
+@dataclass(frozen=True, slots=True)
+class FaultState:
+    """Memory of the fault monitor between ticks: what was seen of each, and the ones that are latched."""
+
+    seen: Mapping[str, Seen] = field(default_factory=dict)
+    now_s: float = 0.0
     active: tuple[ActiveFault, ...] = ()
 
 
@@ -84,19 +103,22 @@ def update_faults(
 
     An unknown condition is never ignored: it counts as a STOP until reset, because nobody decided what it means.
     """
-    seen: dict[str, float] = {}
+    seen = {name: later for name, former in state.seen.items() if (later := former.at(now_s - state.now_s)) is not None}
     active: dict[str, ActiveFault] = {}
     for fault in present:
         row = row_for(fault, catalogue)
-        first_s = min(state.first_seen_s.get(fault.name, now_s), now_s)
-        seen[fault.name] = first_s
-        if now_s - first_s >= row.debounce_s:
+        former = seen.get(fault.name, Seen(now_s))
+        first_s = former.first_s
+        # More than its debounce is not counted: once gone for good, it is forgotten in a bounded time.
+        there_s = min(former.there_s, row.debounce_s)
+        seen[fault.name] = Seen(first_s, there_s, now=True)
+        if there_s >= row.debounce_s - ROUNDING_S:
             active[fault.name] = ActiveFault(fault.name, _axes_of(fault.device, row), fault.detail, first_s, True)
     for old in state.active:
         if old.name not in active and old.row.clear is not Clear.WHEN_GONE:
             active[old.name] = ActiveFault(old.name, old.row, old.detail, old.since_s, False)
     ordered = sorted(active.values(), key=lambda f: (-f.row.reaction, f.since_s, f.name))
-    return FaultState(seen, tuple(ordered))
+    return FaultState(seen, now_s, tuple(ordered))
 
 
 def clear_faults(state: FaultState, event: Clear) -> FaultState:
@@ -106,7 +128,7 @@ def clear_faults(state: FaultState, event: Clear) -> FaultState:
     """
     clears = {Clear.ON_REARM: (Clear.ON_REARM,), Clear.ON_RESET: (Clear.ON_REARM, Clear.ON_RESET)}.get(event, ())
     kept = tuple(f for f in state.active if f.present or f.row.clear not in clears)
-    return FaultState(state.first_seen_s, kept)
+    return FaultState(state.seen, state.now_s, kept)
 
 
 def row_for(fault: DeviceFault, catalogue: Mapping[str, FaultRow]) -> FaultRow:

@@ -185,4 +185,12 @@ ROWS = (
         "install graderd's udev rule, or set the latency timer to 1 ms by hand",
         Reaction.WARN,
     ),
+    FaultRow(
+        "servo_bus.lossy",
+        "more than a twentieth of what is asked of the blade servo goes without an answer",
+        "a disturbed or badly terminated RS-485 line, a loose connector, or a computer that is overloaded",
+        "check cable, shield and termination before it is lost; repeats make up for it until then",
+        Reaction.WARN,
+        debounce_s=1.0,
+    ),
 )

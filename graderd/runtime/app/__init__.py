@@ -5,6 +5,7 @@ The functions import what they need when called, so that ``graderd --help`` and 
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,11 +13,13 @@ if TYPE_CHECKING:
     from graderd.config import Config
 
 
-def run_daemon(config_path: Path | None, sim: bool, rig_dir: Path | None, as_json: bool) -> int:
+def run_daemon(
+    config_path: Path | None, sim: bool, rig_dir: Path | None, as_json: bool, log_level: int = logging.INFO
+) -> int:
     """See :func:`graderd.runtime.app.daemon.run_daemon`."""
     from graderd.runtime.app.daemon import run_daemon as run
 
-    return run(config_path, sim, rig_dir, as_json)
+    return run(config_path, sim, rig_dir, as_json, log_level)
 
 
 def run_guard(config_path: Path | None) -> int:

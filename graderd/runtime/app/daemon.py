@@ -7,7 +7,9 @@ import gc
 import logging
 import shutil
 import signal
+from collections.abc import Callable, Coroutine
 from pathlib import Path
+from typing import Any
 
 from graderd.api.app import make_app
 from graderd.api.server import serve
@@ -33,13 +35,17 @@ from graderd.runtime.sd_notify import SystemdNotifier
 from graderd.runtime.state_file import StateFile
 
 STATUS_LINE_S = 5.0
+RESTART_S = 1.0
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 log = logging.getLogger("graderd")
 
 
-def run_daemon(config_path: Path | None, sim: bool, rig_dir: Path | None, as_json: bool) -> int:
-    """Run until SIGINT or SIGTERM. Returns the exit status: 0 after a clean end, 1 where it could not run."""
-    set_up_logging(as_json)
+def run_daemon(
+    config_path: Path | None, sim: bool, rig_dir: Path | None, as_json: bool, log_level: int = logging.INFO
+) -> int:
+    """Run until SIGINT, SIGTERM or SIGHUP. Returns the exit status: 0 after a clean end, 1 where it could not run."""
+    set_up_logging(as_json, log_level)
     try:
         config = load(config_path)
         refusals = problems(config)
@@ -97,7 +103,8 @@ class Daemon:
             config.camera, config.camera.calibration, config.perception, config.blade, clock
         )
         self._devices = build_devices(config, clock, on_bus_stop=self._stop_from_bus)
-        self._loop = ControlLoop(config, self._devices, self._eyes, clock, StateFile(config.state.directory))
+        self._state_file = StateFile(config.state.directory)
+        self._loop = ControlLoop(config, self._devices, self._eyes, clock, self._state_file)
         services = build_services(config, self._devices, self._loop, self._eyes)
         self._port = Port(config, self._loop, self._devices, self._eyes, services)
         self._recorder = Recorder(config)
@@ -117,13 +124,20 @@ class Daemon:
         self._loop.stop_now(cmd.Stop(reason=reason, client="stop input"))
 
     def _after_tick(self) -> None:
-        """Runs in the tick: nothing here may wait."""
+        """Runs in the tick: nothing here may wait, and nothing that fails here may end it."""
         self._notifier.feed_watchdog()
-        self._hang_watch.ticked(self._loop.tick.now_s)
-        self._port.published()
         tick = self._loop.tick
-        self._recorder.take(tick.now_s, self._port.status)
-        self._devices.publish_faults(tick.device_faults(), tick.state.mode is Mode.STOPPED)
+        tells: tuple[Callable[[], None], ...] = (
+            lambda: self._hang_watch.ticked(tick.now_s),
+            lambda: self._devices.publish_faults(tick.device_faults(), tick.state.mode is Mode.STOPPED),
+            self._port.published,
+            lambda: self._recorder.take(tick.now_s, self._port.status),
+        )
+        for tell in tells:
+            try:
+                tell()
+            except Exception:
+                log.exception("after a tick: failed")
         if tick.now_s >= self._status_line_due_s:
             self._status_line_due_s = tick.now_s + STATUS_LINE_S
             self._notifier.status(f"{tick.state.mode}: {tick.state.reason}")
@@ -131,26 +145,20 @@ class Daemon:
     async def run(self) -> None:
         """Run until a signal, then stop motion, close the devices in the configured order, and return."""
         running = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in ENDING_SIGNALS:
             running.add_signal_handler(number, self._on_signal, number)
         answering = asyncio.Event()
         try:
             async with asyncio.TaskGroup() as group:
-                api = group.create_task(self._serve(answering), name="api")
+                api = group.create_task(self._interface(answering), name="api")
                 # A second daemon learns here that the socket is taken: before it touches a device.
                 await answering.wait()
                 remember(self._config, self._source)
                 tasks = [
-                    group.create_task(self._loop.run(), name="control-tick"),
-                    group.create_task(self._eyes.run(), name="perception"),
+                    group.create_task(self._tick(), name="control-tick"),
                     group.create_task(open_devices(self._devices), name="open-devices"),
-                    group.create_task(self._health.run(), name="health"),
-                    group.create_task(self._recorder.run(), name="recorder"),
+                    *(group.create_task(keep_running(name, run), name=name) for name, run in self._helpers().items()),
                 ]
-                if self._stop_input is not None:
-                    tasks.append(group.create_task(self._stop_input.run(), name="stop-input"))
-                if self._rig is not None:
-                    tasks.append(group.create_task(self._rig.run(), name="rig"))
                 self._notifier.ready("disarmed")
                 log.info("ready on %s, disarmed", self._config.api.socket)
                 await self._ended.wait()
@@ -162,10 +170,39 @@ class Daemon:
         finally:
             self._hang_watch.close()
             await self._close_devices()
+            self._state_file.settle()
             # Not earlier: a second signal, taken the default way, would end the process before the wires are safe.
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in ENDING_SIGNALS:
                 running.remove_signal_handler(number)
             self._notifier.close()
+
+    async def _tick(self) -> None:
+        """The control loop. Where it fails, motion ends before anything else is ended in order."""
+        try:
+            await self._loop.run()
+        except Exception:
+            self._devices.hold_all()
+            raise
+
+    def _helpers(self) -> dict[str, Callable[[], Coroutine[Any, Any, None]]]:
+        """What may fail without a word to the blade, and is started again; what it fails to do is told as a fault."""
+        helpers = {"perception": self._eyes.run, "health": self._health.run, "recorder": self._recorder.run}
+        if self._stop_input is not None:
+            helpers["stop-input"] = self._stop_input.run
+        if self._rig is not None:
+            helpers["rig"] = self._rig.run
+        return helpers
+
+    async def _interface(self, answering: asyncio.Event) -> None:
+        """The interface: what keeps it from starting ends the daemon, what fails later is started again."""
+        try:
+            await self._serve(answering)
+        except Exception as error:
+            if not answering.is_set():
+                raise
+            log.error("the interface failed and is started again: %s", error)
+            await asyncio.sleep(RESTART_S)
+            await keep_running("api", lambda: self._serve(asyncio.Event()))
 
     async def _serve(self, answering: asyncio.Event) -> None:
         api = self._config.api
@@ -194,6 +231,8 @@ class Daemon:
             async with asyncio.timeout(self._config.control.shutdown_timeout_s):
                 for part in order:
                     await self._close_part(part)
+                if self._devices.vehicle is not None:
+                    await self._devices.vehicle.close()
                 await self._devices.link.close()
         except TimeoutError:
             log.error("devices did not close within %.1f s", self._config.control.shutdown_timeout_s)
@@ -203,6 +242,16 @@ class Daemon:
         for result in await asyncio.gather(*(device.close() for device in devices), return_exceptions=True):
             if isinstance(result, Exception):
                 log.error("closing %s: %s", part, result)
+
+
+async def keep_running(name: str, run: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Run it until it ends by itself; what fails is told and started again, and never ends control."""
+    while True:
+        try:
+            return await run()
+        except Exception as error:
+            log.exception("%s failed and is started again: %s", name, error)
+            await asyncio.sleep(RESTART_S)
 
 
 def _leaves(group: BaseExceptionGroup[DeviceError]) -> list[DeviceError]:

@@ -10,10 +10,13 @@ from graderd.drivers.j1939.bus_health import BusEvent
 from graderd.drivers.j1939.can_logs import candump_line
 from graderd.drivers.j1939.ids import Frame
 from graderd.drivers.j1939.link import CanLink
+from graderd.drivers.j1939.vehicle import J1939Vehicle
+from graderd.drivers.simulated.vehicle import SimulatedVehicle
 from graderd.hal.clock import Clock
 from graderd.hal.fault import DeviceFault
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.service import DeviceService
+from graderd.hal.vehicle import Vehicle
 from graderd.runtime.app.backends import actuator_of, rotator_of, stop_input_of
 from graderd.runtime.devices import Devices
 from graderd.runtime.stop_input import StopInputWatch
@@ -42,7 +45,7 @@ def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], Non
     def publish(faults: tuple[DeviceFault, ...], stopped: bool) -> None:
         link.publish_faults(faults, stopped=stopped)
 
-    def watch_bus(listener: Callable[[str], None]) -> Callable[[], None]:
+    def watch_can(listener: Callable[[str], None]) -> Callable[[], None]:
         def write(item: Frame | BusEvent, now_s: float) -> None:
             listener(candump_line(item, now_s))
 
@@ -60,8 +63,20 @@ def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], Non
         actuators=actuators,
         services=services,
         publish_faults=publish,
-        watch_bus=watch_bus,
+        buses={"can": watch_can, **backend.buses(rotator)},
+        vehicle=_vehicle(config, link, clock),
     )
+
+
+def _vehicle(config: Config, link: CanLink, clock: Clock) -> Vehicle | None:
+    """What tells the machine's speed, or None where the configuration names nothing."""
+    match config.vehicle.source:
+        case "j1939":
+            return J1939Vehicle(config.vehicle, link)
+        case "simulated":
+            return SimulatedVehicle(config.vehicle.path, clock)
+        case "none":
+            return None
 
 
 def build_stop_input(config: Config, clock: Clock, on_stop: Callable[[str], None]) -> StopInputWatch | None:

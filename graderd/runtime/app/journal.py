@@ -7,12 +7,15 @@ is made printable: a name that a client chose cannot end a line and begin anothe
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import json
 import logging
 import os
+import queue
 import socket
 import sys
-import time
+import threading
 from pathlib import Path
 
 from graderd.hal.repeats import RepeatFilter
@@ -20,6 +23,8 @@ from graderd.hal.text import printable
 
 JOURNAL_SOCKET = Path("/run/systemd/journal/socket")
 FIELDS = ("device", "mode", "client", "fault")
+LATER_MOST_N = 2000
+LATER_END_S = 1.0
 MESSAGE_MOST_BYTES = 32_768
 """Longer than any text of ours; a datagram has to hold it."""
 
@@ -56,7 +61,12 @@ class _PriorityLine(_Line):
 
 class _JsonLine(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
-        line = {"time": time.time(), "level": record.levelname.lower(), "event": "log", "message": record.getMessage()}
+        line = {
+            "time": record.created,
+            "level": record.levelname.lower(),
+            "event": "log",
+            "message": record.getMessage(),
+        }
         line |= fields_of(record)
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
@@ -123,18 +133,86 @@ def _field(name: str, value: str) -> bytes:
     return name.encode() + b"\n" + len(data).to_bytes(8, "little") + data + b"\n"
 
 
-def set_up_logging(as_json: bool) -> None:
+class LaterHandler(logging.Handler):
+    """Hands every record to a thread, which has the other handler write it: who logs never waits for a reader.
+
+    Where that handler does not keep up (a full pipe that nobody reads), :data:`LATER_MOST_N` records wait and what
+    comes beyond is lost; the next line that gets through says how many were.
+    """
+
+    def __init__(self, handler: logging.Handler) -> None:
+        super().__init__()
+        self._handler = handler
+        self._records: queue.Queue[logging.LogRecord | None] = queue.Queue(LATER_MOST_N)
+        self._lost_n = 0
+        self._thread = threading.Thread(target=self._write, name="log", daemon=True)
+        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queue the record, its text made now: what it names may change."""
+        record = copy.copy(record)
+        record.msg, record.args = record.getMessage(), None
+        try:
+            self._records.put_nowait(record)
+        except queue.Full:
+            self._lost_n += 1
+
+    def close(self) -> None:
+        """Wait for what was said to be written, not longer than :data:`LATER_END_S`."""
+        with contextlib.suppress(queue.Full):
+            self._records.put_nowait(None)
+            self._thread.join(LATER_END_S)
+        super().close()
+
+    def _write(self) -> None:
+        while (record := self._records.get()) is not None:
+            if self._lost_n:
+                lost_n, self._lost_n = self._lost_n, 0
+                told = f"{lost_n} lines of this log were lost: it was not read for too long"
+                self._handler.handle(logging.LogRecord(__name__, logging.WARNING, __file__, 0, told, None, None))
+            self._handler.handle(record)
+
+
+class _StandardError(logging.Handler):
+    """Writes to the file itself. ``sys.stderr`` has a lock, and whoever ends the process waits for it."""
+
+    def __init__(self, descriptor: int) -> None:
+        super().__init__()
+        self._descriptor = descriptor
+        self.lock = None  # only one thread writes, and one that hangs in a full pipe must not be waited for
+
+    def handle(self, record: logging.LogRecord) -> bool:
+        """Write it."""
+        self.emit(record)
+        return True
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write the whole line; a reader that is gone has nothing to be told."""
+        data = f"{self.format(record)}\n".encode("utf-8", "replace")
+        with contextlib.suppress(OSError):
+            while data:
+                data = data[os.write(self._descriptor, data) :]
+
+    def acquire(self) -> None:
+        """As :attr:`lock`."""
+
+    def release(self) -> None:
+        """As :attr:`lock`."""
+
+
+def set_up_logging(as_json: bool, level: int = logging.INFO) -> None:
     """One line an event, repeated ones ever more rarely: to the journal where standard error is the journal's, else to
-    standard error (a terminal gets the time from us)."""
-    handler = _handler(as_json)
+    standard error (a terminal gets the time from us). ``level``: the least that graderd's own entries must have; what
+    libraries say counts from warning on, or from ``level`` where that is higher."""
+    handler = LaterHandler(_handler(as_json))
     handler.addFilter(RepeatFilter())
-    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
-    logging.getLogger("graderd").setLevel(logging.INFO)
-    logging.getLogger("can").setLevel(logging.ERROR)
+    logging.basicConfig(level=max(logging.WARNING, level), handlers=[handler], force=True)
+    logging.getLogger("graderd").setLevel(level)
+    logging.getLogger("can").setLevel(max(logging.ERROR, level))
 
 
 def _handler(as_json: bool) -> logging.Handler:
-    lines = logging.StreamHandler(sys.stderr)
+    lines = _lines()
     if as_json:
         lines.setFormatter(_JsonLine())
     elif not _stderr_is_the_journals():
@@ -146,6 +224,13 @@ def _handler(as_json: bool) -> logging.Handler:
         except OSError:
             return lines  # a journal that only reads what we print
     return lines
+
+
+def _lines() -> logging.Handler:
+    try:
+        return _StandardError(sys.stderr.fileno())
+    except (OSError, ValueError):
+        return logging.StreamHandler(sys.stderr)  # a test that captures it
 
 
 def _stderr_is_the_journals() -> bool:

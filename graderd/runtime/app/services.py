@@ -7,9 +7,9 @@ import base64
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from graderd.config import Config
 from graderd.drivers.dynamixel.step import StepSample, analyse, render
@@ -23,7 +23,6 @@ from graderd.runtime.devices import Devices
 from graderd.runtime.maneuver import Maneuver
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 
-T = TypeVar("T", bound=Settings)
 STEP_SHARES = (1.0, 0.5, 0.0, 0.5, 0.0)
 """Up, half-way down, down, half-way up, back: the half-way goal is reached from both sides, which shows backlash."""
 SETTLE_S = 0.5
@@ -54,24 +53,33 @@ def build_services(
     """The services by name."""
     frames = CalibrationFrames(config.state.directory)
 
-    async def step_response(arguments: dict[str, Any]) -> dict[str, Any]:
-        wanted = _checked(StepArguments, arguments)
+    async def step_response(wanted: StepArguments) -> dict[str, Any]:
         return await _step_response(config, devices.rotation, loop, wanted)
 
-    async def calibrate(arguments: dict[str, Any]) -> dict[str, Any]:
-        wanted = _checked(CalibrateArguments, arguments)
+    async def calibrate(wanted: CalibrateArguments) -> dict[str, Any]:
         return await _collect_frames(config, loop, eyes, frames, wanted)
 
-    async def calibration_file(arguments: dict[str, Any]) -> dict[str, Any]:
-        wanted = _checked(FileArguments, arguments)
+    async def calibration_file(wanted: FileArguments) -> dict[str, Any]:
         # One file a request, encoded in a thread: the tick shares this loop.
         return {"base64": await asyncio.to_thread(lambda: base64.b64encode(frames.take(wanted.file)).decode())}
 
     return {
         **devices.services,
-        "rotation.step_response": DeviceService(step_response),
-        "camera.calibrate": DeviceService(calibrate),
-        "camera.calibration_file": DeviceService(calibration_file, only_reads=True),
+        "rotation.step_response": DeviceService(
+            step_response, moves=True, arguments=StepArguments, summary="Turn the blade by a step and back, and report"
+        ),
+        "camera.calibrate": DeviceService(
+            calibrate,
+            moves=True,
+            arguments=CalibrateArguments,
+            summary="Turn the empty blade to each angle and save one frame there",
+        ),
+        "camera.calibration_file": DeviceService(
+            calibration_file,
+            only_reads=True,
+            arguments=FileArguments,
+            summary="A picture of the last calibration, once",
+        ),
     }
 
 
@@ -156,11 +164,3 @@ async def _collect_frames(
         frames.discard()
         raise
     return {"frame_set": folder.name, "frames_n": len(wanted.angles_deg), "files": frames.names()}
-
-
-def _checked(model: type[T], arguments: dict[str, Any]) -> T:
-    try:
-        return model.model_validate(arguments)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise CommandRangeError(".".join(map(str, first["loc"])) or "arguments", first["msg"]) from None

@@ -159,6 +159,8 @@ def attach(config: Config, directory: Path) -> Config:
     if isinstance(config.rotation, Ph54Settings):
         on_rig = {"port": rig["servo"], "usb_serial_number": ""}
         changes["rotation"] = config.rotation.model_copy(update=on_rig)
+    if config.vehicle.source != "j1939":
+        changes["vehicle"] = config.vehicle.model_copy(update={"source": "simulated", "path": rig["control"]})
     if config.stop_input.backend == "simulated":
         changes["stop_input"] = config.stop_input.model_copy(update={"port": rig["stop_input"]})
     return config.model_copy(update=changes)

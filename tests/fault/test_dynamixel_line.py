@@ -1,0 +1,111 @@
+"""What the servo's line does to everything else: losses, babble, lateness, twins, and a plug pulled while closing."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from graderd.drivers.dynamixel.bus import ServoBus
+from graderd.hal.errors import DeviceTimeoutError, LifecycleError, WrongDeviceError
+from graderd.hal.lifecycle import Lifecycle
+from tests.contract.conformance import all_known, state
+from tests.dynamixel_sim import Bench, bench
+
+
+@pytest.fixture
+async def rig(tmp_path: Path) -> AsyncIterator[Bench]:
+    async with bench(tmp_path, wire={"seed": 5}) as made:
+        yield made
+
+
+@pytest.fixture
+async def bus(rig: Bench) -> AsyncIterator[ServoBus]:
+    """A bus of the test's own, on the rig's wire."""
+    await rig.rotator.close()
+    made = ServoBus(str(rig.bus.link), 57_600, clock=rig.clock)
+    made.open()
+    yield made
+    made.close()
+
+
+@pytest.mark.timeout(60)
+async def test_15_percent_loss_is_told_and_nothing_else_happens(tmp_path: Path) -> None:
+    """As many exchanges as in a minute at the default poll rate."""
+    async with bench(tmp_path, wire={"seed": 11}, poll_hz=200.0) as rig:
+        await rig.rotator.arm()
+        rig.bus.inject("drop", rate=0.08)
+        rig.bus.inject("drop_requests", rate=0.08)
+        from_n, told = rig.bus.requests_n, set[str]()
+        while rig.bus.requests_n - from_n < 5000:
+            rig.rotator.set_goal_deg(5.0)
+            await asyncio.sleep(0.02)
+            told |= rig.conditions()
+            assert rig.rotator.lifecycle is Lifecycle.ACTIVE, rig.rotator.faults()
+        assert told == {"lossy"}
+        assert all_known(rig.rotator.faults())
+        rig.bus.clear_faults()
+        await rig.until(lambda: not rig.conditions())
+
+
+async def test_a_lost_servo_is_told_in_time(rig: Bench) -> None:
+    rig.bus.inject("drop")
+    began_s = rig.clock.now_s()
+    await rig.until(lambda: rig.rotator.lifecycle is Lifecycle.FAILED)
+    assert 0.2 < rig.clock.now_s() - began_s < 0.6
+
+
+async def test_a_damaged_instruction_answered_crc_error_is_unanswered(rig: Bench, bus: ServoBus) -> None:
+    rig.bus.inject("damage_requests")
+    with pytest.raises(DeviceTimeoutError):
+        await bus.read(1, 580, 4, attempts_n=2)
+    assert bus.counters()["damaged_requests_n"] == 2
+
+
+async def test_a_header_that_claims_a_long_packet_swallows_no_reply(rig: Bench, bus: ServoBus) -> None:
+    rig.bus.inject("babble", length=1000)
+    for _ in range(5):
+        await bus.read(1, 580, 4, attempts_n=1)
+
+
+async def test_readings_carry_the_time_at_which_the_servo_measured(rig: Bench) -> None:
+    rig.bus.inject("delay", seconds=0.04)
+    for _ in range(8):  # until the line's lateness is known
+        await rig.rotator.wait_telemetry()
+    angle = (await rig.rotator.wait_telemetry()).angle_deg
+    assert angle is not None
+    assert angle.age_s(rig.clock.now_s()) > 0.035
+
+
+async def test_two_servos_with_one_id_are_told_as_such(tmp_path: Path) -> None:
+    async with bench(tmp_path, opened=False) as rig:
+        rig.bus.inject("twin")
+        with pytest.raises(WrongDeviceError, match="two servos answer to id 1"):
+            await rig.rotator.open()
+        assert "wrong_device" in rig.conditions()
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.005, 0.02, 0.05])
+async def test_closed_is_closed_though_the_plug_is_pulled_meanwhile(rig: Bench, after_s: float) -> None:
+    await rig.rotator.arm()
+    await rig.drive(50.0, rig.past(10.0))
+    closing = asyncio.create_task(rig.rotator.close())
+    await asyncio.sleep(after_s)
+    await rig.bus.unplug()
+    async with asyncio.timeout(3.0):
+        await closing
+    assert state(rig.rotator) is Lifecycle.CLOSED
+    await rig.bus.replug()
+    await asyncio.sleep(0.3)
+    assert state(rig.rotator) is Lifecycle.CLOSED
+    await rig.rotator.open()
+    assert state(rig.rotator) is Lifecycle.STANDBY
+
+
+async def test_nobody_waits_for_the_telemetry_of_a_closed_servo(rig: Bench) -> None:
+    await rig.rotator.close()
+    async with asyncio.timeout(1.0):
+        with pytest.raises(LifecycleError, match="closed"):
+            await rig.rotator.wait_telemetry()

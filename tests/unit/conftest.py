@@ -1,0 +1,29 @@
+"""`make unit` takes seconds: a test here starts no process and serves no socket, unless it says so (``live``)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+LIVE = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system", "socket.bind"}
+"""Events of PEP 578, which no library gets around."""
+_judged = ""
+
+
+def _refuse(event: str, _: tuple[object, ...]) -> None:
+    if _judged and event in LIVE:
+        raise RuntimeError(f"{_judged}: {event} in a unit test; mark it @pytest.mark.live")
+
+
+sys.addaudithook(_refuse)
+
+
+@pytest.fixture(autouse=True)
+def as_marked(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Hold the test to its mark."""
+    global _judged
+    _judged = "" if request.node.get_closest_marker("live") else request.node.nodeid
+    yield
+    _judged = ""
