@@ -14,6 +14,7 @@ from graderd.perception.annotate import text_on
 from graderd.perception.classifier import SoilClassifier
 from graderd.perception.color import paper_steps
 from graderd.perception.geometry import U8
+from graderd.perception.registration import Stance
 from graderd.simulator.camera.appearance import Appearance
 from graderd.simulator.camera.ground import SceneState
 from graderd.simulator.camera.renderer import Renderer
@@ -69,7 +70,7 @@ def main() -> None:
     )
     hard = photograph(Appearance(soil="gravel", ground="plywood", blade="rusty", red_cast=0.25))
     fused = SoilClassifier(PerceptionSettings(), calibration, blade, live=False)
-    soil = fused.height_map(hard, ANGLE_DEG)
+    soil = fused.height_map(hard, Stance(ANGLE_DEG))
     assert soil is not None
     assert hard.depth_mm is not None
     shade = np.clip(hard.depth_mm / 1700 * 255, 0, 255).astype(np.uint8)

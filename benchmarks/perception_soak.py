@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from graderd.core.attitude import UNMEASURED
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Zone
 from graderd.hal.camera import Camera, EndOfFrames, Frame
@@ -131,7 +132,7 @@ async def soak(path: Path, count: int) -> bool:
     try:
         while not worker.status().restarts_n:
             now_s = clock.now_s()
-            worker.send_angle(0.0, now_s)
+            worker.send_angle(0.0, now_s, UNMEASURED)
             observation = worker.take_observation()
             if observation is not None:
                 zones[observation.zone] += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from graderd.core.attitude import MeasuredAttitude
 from graderd.core.soil import SoilObservation
 from graderd.hal.clock import ManualClock
 from graderd.hal.errors import CommandRangeError, DeviceError, DeviceMissingError, LifecycleError
@@ -194,7 +195,7 @@ class FakeEyes:
     def faults(self) -> tuple[DeviceFault, ...]:
         return tuple(self.present)
 
-    def send_angle(self, angle_deg: float, time_s: float) -> None:
+    def send_angle(self, angle_deg: float, time_s: float, attitude: MeasuredAttitude) -> None:
         self.angles.append((angle_deg, time_s))
 
 

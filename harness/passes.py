@@ -13,6 +13,7 @@ import numpy as np
 
 from graderd.config import Config
 from graderd.core import commands as cmd
+from graderd.core.attitude import MeasuredAttitude
 from graderd.core.axes import ACTUATORS
 from graderd.core.machine import Mode
 from graderd.core.soil import SoilObservation, Zone
@@ -40,6 +41,9 @@ UNDECIDED_S = 4.0
 """No decision for so long: the machine drives all the same."""
 FIXED_DEG = 15.0
 OPPOSITE = {"left": "right", "right": "left"}
+
+ON_GROUND = MeasuredAttitude(2.0, 0.0, 0.0)
+"""What the lifts and the tilt measure while the edge drags."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +167,8 @@ class LoopPass:
         color, depth = self._renderer.render(seen, Appearance())
         lenses = self._renderer.color_intrinsics, self._renderer.depth_intrinsics
         frame = Frame(color, depth, *lenses, self.now_s, self._number, self._number)
-        self._coming.append((self.now_s + self.SEEN_AFTER_S, self._classifier.classify(frame, self.angle_deg, 0.01)))
+        observation = self._classifier.classify(frame, self.angle_deg, 0.01, ON_GROUND)
+        self._coming.append((self.now_s + self.SEEN_AFTER_S, observation))
 
     def _sensed(self, commands: tuple[cmd.AnyCommand, ...]) -> Sensed:
         now_s, lifecycle = self.now_s, Lifecycle.ACTIVE if self._powered else Lifecycle.STANDBY

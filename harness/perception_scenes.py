@@ -5,6 +5,7 @@ Independent of the rig's renderer on purpose: perception is tested against two p
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import cv2
@@ -51,6 +52,8 @@ class Scene:
     noise_px: float = 0.08
     holes: float = 0.04
     blade: BladeGeometry = field(default_factory=BladeGeometry)
+    ground: Callable[[F64, F64], F64] | None = None
+    """Height of the bare ground at x and y (m); None: level."""
 
 
 def moved(stream: StreamCalibration, error: PoseError) -> StreamCalibration:
@@ -87,7 +90,10 @@ def height_field(scene: Scene) -> F64:
     elif scene.zone is Zone.EVEN:
         height = ridge(0.0, 0.55, 0.6 * scene.height_m)
     rough = cv2.GaussianBlur(rng.normal(size=height.shape), (0, 0), 3) * 0.03
-    return np.asarray(np.where(height > 0.005, np.maximum(height + rough * 0.5, 0), rough * 0.1), dtype=np.float64)
+    height = np.where(height > 0.005, np.maximum(height + rough * 0.5, 0), rough * 0.1)
+    if scene.ground is not None:
+        height += scene.ground(gx, gy)
+    return np.asarray(height, dtype=np.float64)
 
 
 def volumes_l(scene: Scene, heights: F64) -> tuple[float, float, float]:

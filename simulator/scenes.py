@@ -192,7 +192,7 @@ def _appearance(rng: np.random.Generator) -> Appearance:
         blade=_pick(rng, get_args(BladeMaterial)),
         ground=_pick(rng, get_args(GroundKind)),
         color_noise=float(rng.uniform(1.0, 5.0)),
-        disparity_noise_px=float(rng.uniform(0.06, 0.14)),
+        disparity_noise_px=float(rng.uniform(0.09, 0.37)),
         hole_share=float(rng.uniform(0.12, 0.3)) if rng.random() < 0.1 else float(rng.uniform(0.02, 0.08)),
     )
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from graderd.drivers.realsense import sdk
 from graderd.hal.camera import Frame, Intrinsics
 from graderd.hal.errors import DeviceLostError, DeviceMissingError, DeviceTimeoutError, LifecycleError, WrongDeviceError
-from graderd.hal.settings import CameraSettings
+from graderd.hal.settings import DEPTH_PRESETS, CameraSettings
 
 QUEUE_N = 2
 KEPT_DEPTH_N = 4
@@ -28,7 +28,10 @@ DEPTH_GRACE_PERIODS = 3.0
 """Colour waits so many frame periods for its depth before it goes on alone."""
 RESET_WAIT_S = 10.0
 EXPOSURE_UNIT_US = 100.0
-"""UVC counts the colour sensor's exposure in steps of 100 microseconds (UVC 1.5, 4.2.2.1.4)."""
+"""UVC counts the colour sensor's exposure in steps of 100 microseconds (UVC 1.5, 4.2.2.1.4); the depth sensor's is in
+single ones."""
+Options = list[tuple[sdk.Rs, float | None]]
+"""Options in the order in which they are set; None is left as it is."""
 
 
 def attached() -> list[sdk.Rs]:
@@ -69,7 +72,7 @@ class RealSenseCamera:
         return self._description
 
     def open(self) -> None:
-        """Find the camera, open colour and depth, set and lock exposure and white balance.
+        """Find the camera, set what the settings say of both sensors, open colour and depth.
 
         Raises:
             DeviceMissingError: no camera, or not the one with this serial number.
@@ -90,7 +93,9 @@ class RealSenseCamera:
         self._device = device
         self._description = _describe(device)
         try:
-            self._set_options(color[0])
+            _set_options(color[0], self._color_options())
+            if depth is not None:
+                _set_options(depth[0], self._depth_options())
             self._color = _start(*color)
             self._depth = _start(*depth) if depth is not None else None
         except RuntimeError as error:
@@ -127,28 +132,35 @@ class RealSenseCamera:
             "Correct camera.serial_number",
         )
 
-    def _set_options(self, sensor: sdk.Rs) -> None:
+    def _color_options(self) -> Options:
         rs, settings = sdk.load(), self._settings
-        pairs = [
+        return [
             (rs.option.enable_auto_exposure, float(settings.exposure_us is None and settings.gain is None)),
             (rs.option.exposure, settings.exposure_us and settings.exposure_us / EXPOSURE_UNIT_US),
             (rs.option.gain, settings.gain),
             (rs.option.enable_auto_white_balance, float(settings.white_balance_k is None)),
             (rs.option.white_balance, settings.white_balance_k),
         ]
-        for option, value in pairs:
-            if value is None or not sensor.supports(option) or sensor.is_option_read_only(option):
-                continue
-            span = sensor.get_option_range(option)
-            # Out of range or refused is seen in the read-back, and reported from there.
-            with contextlib.suppress(RuntimeError):
-                sensor.set_option(option, min(max(value, span.min), span.max))
+
+    def _depth_options(self) -> Options:
+        rs, settings = sdk.load(), self._settings
+        preset = settings.depth_preset and float(DEPTH_PRESETS.index(settings.depth_preset))
+        return [
+            (rs.option.visual_preset, preset),  # first: a preset sets what follows
+            (rs.option.emitter_enabled, float(settings.depth_emitter)),
+            (rs.option.laser_power, settings.depth_laser_mw),
+            (rs.option.enable_auto_exposure, float(settings.depth_exposure_us is None and settings.depth_gain is None)),
+            (rs.option.exposure, settings.depth_exposure_us),
+            (rs.option.gain, settings.depth_gain),
+        ]
 
     def settings_read_back(self) -> dict[str, float]:
-        """What the colour sensor says: ``exposure_us``, ``gain``, ``white_balance_k``, ``auto_*`` (0 or 1)."""
+        """What both sensors say: ``exposure_us``, ``gain``, ``white_balance_k``, ``auto_*`` (0 or 1) of colour;
+        ``depth_preset`` (its number), ``depth_emitter`` (0 or 1), ``depth_laser_mw``, ``depth_exposure_us``,
+        ``depth_gain`` and ``depth_auto_exposure`` of depth."""
         if self._color is None:
             return {}
-        rs, sensor = sdk.load(), self._color.sensor
+        rs = sdk.load()
         names = {
             "exposure_us": (rs.option.exposure, EXPOSURE_UNIT_US),
             "gain": (rs.option.gain, 1.0),
@@ -156,11 +168,17 @@ class RealSenseCamera:
             "auto_exposure": (rs.option.enable_auto_exposure, 1.0),
             "auto_white_balance": (rs.option.enable_auto_white_balance, 1.0),
         }
-        values = {}
-        for name, (option, factor) in names.items():
-            if sensor.supports(option):
-                with contextlib.suppress(RuntimeError):
-                    values[name] = float(sensor.get_option(option)) * factor
+        values = _read_options(self._color.sensor, names)
+        if self._depth is not None:
+            names = {
+                "depth_preset": (rs.option.visual_preset, 1.0),
+                "depth_emitter": (rs.option.emitter_enabled, 1.0),
+                "depth_laser_mw": (rs.option.laser_power, 1.0),
+                "depth_exposure_us": (rs.option.exposure, 1.0),
+                "depth_gain": (rs.option.gain, 1.0),
+                "depth_auto_exposure": (rs.option.enable_auto_exposure, 1.0),
+            }
+            values |= _read_options(self._depth.sensor, names)
         return values
 
     def read(self, timeout_s: float) -> Frame:
@@ -287,6 +305,25 @@ class RealSenseCamera:
                     stream.sensor.stop()
                 with contextlib.suppress(RuntimeError):
                     stream.sensor.close()
+
+
+def _set_options(sensor: sdk.Rs, pairs: Options) -> None:
+    for option, value in pairs:
+        if value is None or not sensor.supports(option) or sensor.is_option_read_only(option):
+            continue
+        span = sensor.get_option_range(option)
+        # Out of range or refused is seen in the read-back, and reported from there.
+        with contextlib.suppress(RuntimeError):
+            sensor.set_option(option, min(max(value, span.min), span.max))
+
+
+def _read_options(sensor: sdk.Rs, names: dict[str, tuple[sdk.Rs, float]]) -> dict[str, float]:
+    values = {}
+    for name, (option, factor) in names.items():
+        if sensor.supports(option):
+            with contextlib.suppress(RuntimeError):
+                values[name] = float(sensor.get_option(option)) * factor
+    return values
 
 
 def _poll(queue: sdk.Rs) -> tuple[bool, sdk.Rs]:

@@ -161,7 +161,7 @@ def _live(context: typer.Context, room: Path, angles_deg: str, yes: bool, as_jso
         print_text(
             f"The blade will turn to {', '.join(f'{angle:+g}' for angle in angles)} degrees, one after the other."
         )
-    _agree("Is the blade empty and off the ground, and is everybody clear of it? Turn it now?", yes)
+    _agree("Is the blade empty and just above level ground, and is everybody clear of it? Turn it now?", yes)
     answer = daemon.service("camera.calibrate", LIVE_TIMEOUT_S, consent=True, angles_deg=angles)
     folder = room / _plain(answer["frame_set"])
     folder.mkdir()
@@ -193,7 +193,7 @@ def _solve(settings: Config, frames: FrameSet, start_pose: dict[str, float] | No
     if start_pose is not None:
         start = with_pose(start, start_pose)
     try:
-        views = [EmptyBlade(frame, entry.blade_angle_deg) for entry, frame in frames.frames()]
+        views = [EmptyBlade(frame, entry.blade_angle_deg, entry.attitude) for entry, frame in frames.frames()]
         return calibrate(views, start, settings.blade, f"{datetime.now(UTC):%Y-%m-%d %H:%M} from {frames.folder.name}")
     except DeviceError as error:
         raise CliError(error.where, error.cause, error.remedy, ExitCode.USAGE) from None

@@ -53,7 +53,7 @@ def register(app: typer.Typer) -> None:
     def classify(
         source: Annotated[Path, typer.Argument(help="Picture, folder of pictures, video, recording or frame set.")],
         method: Annotated[
-            MethodName | None, typer.Option(help="Default: fused where the source has depth, else fast_color.")
+            MethodName | None, typer.Option(help="Default: depth where the source has it, else fast_color.")
         ] = None,
         config: Annotated[
             Path | None,
@@ -197,7 +197,9 @@ class Run:
         angle_deg = self._angle_deg
         if angle_deg is None:
             angle_deg = entry.blade_angle_deg if entry else 0.0
-        return self._classifier.classify(frame, angle_deg, 0.0)
+        if entry is None:
+            return self._classifier.classify(frame, angle_deg, 0.0)
+        return self._classifier.classify(frame, angle_deg, 0.0, entry.attitude)
 
     def _classifier_for(self, frame: Frame) -> Classifier:
         from graderd.core.blade import BladeGeometry
@@ -206,7 +208,7 @@ class Run:
         has_depth = frame.depth_mm is not None
         method = self._method
         if method is None:
-            method = MethodName.FUSED if has_depth else MethodName.FAST_COLOR
+            method = MethodName.DEPTH if has_depth else MethodName.FAST_COLOR
         if method in (MethodName.DEPTH, MethodName.FUSED) and not has_depth:
             raise CliError(
                 self._camera.description,

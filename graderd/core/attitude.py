@@ -84,6 +84,9 @@ class MeasuredAttitude:
     pitch_deg: float | None = None
 
 
+UNMEASURED = MeasuredAttitude()
+
+
 def measured_attitude(geometry: AttitudeGeometry, pose: Pose) -> MeasuredAttitude:
     """From measured extensions; None where one is not known."""
     pitch = None if pose.tilt_mm is None else pitch_deg(geometry, pose.tilt_mm)

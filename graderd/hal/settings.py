@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, JsonValue, Tag, model_validator
 
@@ -303,6 +303,11 @@ AnyStopInputSettings = Annotated[
 ]
 
 
+DepthPreset = Literal["custom", "default", "hand", "high_accuracy", "high_density", "medium_density"]
+DEPTH_PRESETS: tuple[str, ...] = get_args(DepthPreset)
+"""In the order of their numbers (librealsense, ``rs2_rs400_visual_preset``)."""
+
+
 class VehicleSettings(Settings):
     """Where the machine's speed comes from. Without it a decision is kept by time instead of travel."""
 
@@ -334,6 +339,15 @@ class CameraSettings(Settings):
     exposure_us: Positive | None = Field(None, description="None: automatic")
     gain: Positive | None = None
     white_balance_k: Positive | None = Field(4600.0, description="None: automatic (not advised: colour would drift)")
+    depth_preset: DepthPreset | None = Field(
+        "default", description="of a RealSense's depth sensor; None: left as it is"
+    )
+    depth_emitter: bool = Field(
+        True, description="the infrared pattern: needed in the dark and on ground without texture"
+    )
+    depth_laser_mw: Positive | None = Field(150.0, description="of the pattern; None: as the preset has it")
+    depth_exposure_us: Positive | None = Field(None, description="of the infrared imagers; None: automatic")
+    depth_gain: Positive | None = None
     stale_s: Positive = Field(
         0.5, le=60, description="no frame for so long: unknown at once; a minute only with pictures that come as slowly"
     )

@@ -1,9 +1,13 @@
 """Where the camera really sits: solved from a few frames of the empty blade at known angles.
 
 What is solved: the colour stream's pose (six numbers), and of the blade its length, its height and how far its edge
-lies ahead of the rotation axis. The depth stream moves along with the colour stream: their relation is the camera's
-own and stays. Evidence: the ground (it is z = 0), the hollow face, its ends and its upper edge in the depth pictures;
-the blade's outline in the colour pictures. The rotation axis is found because the face is seen at several angles.
+lies ahead of the rotation axis. Height, cross slope and lean of the edge above the ground come from the measured lifts
+and tilt. Where they are not measured, they are solved instead of the blade's height, which is the drawing's then: a
+raised blade must not become a taller one. Nothing is accepted that is far off the drawing, or under which the empty
+bed of these frames would not be found empty. The depth stream moves along with the colour stream: their relation is
+the camera's own and stays. Evidence: the ground (it is z = 0), the hollow face, its ends and its upper edge in the
+depth pictures; the blade's outline in the colour pictures. The rotation axis is found because the face is seen at
+several angles.
 
 Method: Gauss-Newton with a robust weight; after every step the evidence is looked for again, in a narrower band round
 the blade as it is known by then (as in iterative closest point, Besl & McKay 1992, IEEE PAMI 14(2)).
@@ -16,15 +20,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
+from graderd.core.soil import Zone
 from graderd.hal.camera import Frame, StreamPose
-from graderd.perception.calibration_evidence import ColorEvidence, DepthEvidence, collect_color, collect_depth
+from graderd.perception.calibration_evidence import TOP, ColorEvidence, DepthEvidence, collect_color, collect_depth
+from graderd.perception.depth import DepthJudge
 from graderd.perception.geometry import F64, View
-from graderd.perception.settings import CameraCalibration, StreamCalibration
+from graderd.perception.health import HealthMonitor, obstructed
+from graderd.perception.registration import Stance
+from graderd.perception.settings import CameraCalibration, PerceptionSettings, StreamCalibration
 
 POSE = ("position_x_m", "position_y_m", "position_z_m", "pitch_down_deg", "yaw_deg", "roll_deg")
 GEOMETRY = ("x_offset_m", "length_m", "height_m")
-STEPS = np.array([1e-4, 1e-4, 1e-4, 5e-3, 5e-3, 5e-3, 1e-4, 1e-4, 1e-4])
+STANCE = ("edge_height_m", "edge_slope_deg", "edge_pitch_deg")
+"""How the blade stood in all frames, beyond what was measured."""
+STEPS = np.array([1e-4, 1e-4, 1e-4, 5e-3, 5e-3, 5e-3, 1e-4, 1e-4, 1e-4, 1e-4, 5e-3, 5e-3])
 """Steps of the numerical derivatives: metres and degrees."""
 BANDS_M = (0.14, 0.10, 0.07, 0.05, 0.035, 0.025, 0.02, 0.015, 0.012)
 """How far from the blade's place the evidence is looked for, round by round."""
@@ -32,8 +43,14 @@ COLOR_ONLY_BANDS_M = (0.05, 0.04, 0.03, 0.02, 0.015, 0.012, 0.012, 0.012)
 """Further away, any edge of a picture may pass for the blade's."""
 DEPTH_SIGMA_M = 0.003
 COLOR_SIGMA_PX = 1.0
-PRIOR_SIGMA = np.array([0.5, 0.5, 0.5, 30.0, 30.0, 30.0, 0.02, 0.03, 0.03])
+COLOR_TOP_SIGMA_PX = 6.0
+"""From above, the plate's thickness shows behind the upper edge: where depth tells, colour has little say there."""
+PRIOR_SIGMA = np.array([0.5, 0.5, 0.5, 30.0, 30.0, 30.0, 0.02, 0.03, 0.03, 0.1, 5.0, 15.0])
 """How far a number may plausibly be from where it starts: metres and degrees. Decides only what is not seen."""
+AS_DRAWN_SIGMA_M = 0.0005
+AS_MEASURED_SIGMA = (0.0005, 0.05, 0.05)
+OFF_DRAWING_M = 0.02
+"""A blade that differs from its drawing by more than this is another blade, or was not where it was said to be."""
 COLOR_ONLY_SIGMA_M = 0.003
 """Without depth the picture tells only ratios: the blade's size must be known, and sets the scale."""
 MIN_FRAMES_N = 3
@@ -51,10 +68,11 @@ class CalibrationError(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EmptyBlade:
-    """One frame of the empty blade and the angle it was measured at."""
+    """One frame of the empty blade, and the angle and the attitude it was measured at."""
 
     frame: Frame
     blade_angle_deg: float
+    attitude: MeasuredAttitude = UNMEASURED
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,18 +140,37 @@ class _Solver:
         self._blade = blade
         pose = [float(getattr(start.color, name)) for name in POSE]
         geometry = [float(getattr(blade, name)) for name in GEOMETRY]
-        self._first = np.array(pose + geometry)
+        self._first = np.array(pose + geometry + [0.0] * len(STANCE))
         self._p = self._first.copy()
         self._depth: list[DepthEvidence] = []
         self._color: list[ColorEvidence] = []
         self._information: F64 = np.eye(len(self._p))
         self._prior_sigma = PRIOR_SIGMA.copy()
         if not self._with_depth():
-            self._prior_sigma[len(POSE) :] = COLOR_ONLY_SIGMA_M
+            self._prior_sigma[len(POSE) : -len(STANCE)] = COLOR_ONLY_SIGMA_M
+        measured = [
+            all(getattr(view.attitude, name) is not None for view in views)
+            for name in ("height_mm", "slope_deg", "pitch_deg")
+        ]
+        for index, known in enumerate(measured):
+            if known or not self._with_depth():
+                self._prior_sigma[index - len(STANCE)] = AS_MEASURED_SIGMA[index]
+        if not measured[0]:
+            self._prior_sigma[len(POSE) + GEOMETRY.index("height_m")] = AS_DRAWN_SIGMA_M
 
     def _model(self, p: F64) -> tuple[CameraCalibration, BladeGeometry]:
         calibration = with_pose(self._start, dict(zip(POSE, map(float, p[:6]), strict=True)))
-        return calibration, self._blade.model_copy(update=dict(zip(GEOMETRY, map(float, p[6:]), strict=True)))
+        return calibration, self._blade.model_copy(update=dict(zip(GEOMETRY, map(float, p[6:9]), strict=True)))
+
+    def _stance(self, view: EmptyBlade, p: F64) -> Stance:
+        height_m, slope_deg, pitch_deg = map(float, p[9:])
+        said = Stance(view.blade_angle_deg, view.attitude)
+        attitude = MeasuredAttitude(
+            (said.edge_m(self._blade) + height_m) * 1000.0,
+            (view.attitude.slope_deg or 0.0) + slope_deg,
+            (view.attitude.pitch_deg or 0.0) + pitch_deg,
+        )
+        return Stance(view.blade_angle_deg, attitude)
 
     def _views_of(self, frame: Frame, calibration: CameraCalibration) -> tuple[View, View]:
         color = frame.color_intrinsics or calibration.color.intrinsics().scaled(*frame.color_bgr.shape[1::-1])
@@ -149,10 +186,11 @@ class _Solver:
         self._depth, self._color = [], []
         for view in self._views:
             color_view, depth_view = self._views_of(view.frame, calibration)
+            stance = self._stance(view, self._p)
             if view.frame.depth_mm is not None:
-                self._depth.append(collect_depth(view.frame.depth_mm, depth_view, blade, view.blade_angle_deg, band_m))
+                self._depth.append(collect_depth(view.frame.depth_mm, depth_view, blade, stance, band_m))
             if band_m <= 0.05 or view.frame.depth_mm is None:
-                found = collect_color(view.frame.color_bgr, color_view, blade, view.blade_angle_deg, band_m)
+                found = collect_color(view.frame.color_bgr, color_view, blade, stance, band_m)
                 self._color.append(found)
         if sum(len(e.face) for e in self._depth) + 10 * sum(len(e.at_px) for e in self._color) < 100 * len(self._views):
             raise CalibrationError(
@@ -167,11 +205,12 @@ class _Solver:
         parts: list[F64] = []
         for evidence, view in zip(self._depth, self._with_depth(), strict=True):
             depth_view = self._views_of(view.frame, calibration)[1]
-            parts += [r / DEPTH_SIGMA_M for r in evidence.residuals_m(depth_view, blade)]
+            parts += [r / DEPTH_SIGMA_M for r in evidence.residuals_m(depth_view, blade, self._stance(view, p))]
         colored = self._views if len(self._color) == len(self._views) else self._without_depth()
         for found, view in zip(self._color, colored, strict=True):
             color_view = self._views_of(view.frame, calibration)[0]
-            parts.append(found.residuals_px(color_view, blade) / COLOR_SIGMA_PX)
+            sigma = np.where((found.side == TOP) & bool(self._depth), COLOR_TOP_SIGMA_PX, COLOR_SIGMA_PX)
+            parts.append(found.residuals_px(color_view, blade, self._stance(view, p)) / sigma)
         return np.concatenate(parts)
 
     def _with_depth(self) -> list[EmptyBlade]:
@@ -202,17 +241,19 @@ class _Solver:
         parts_mm: list[F64] = []
         for evidence, view in zip(self._depth, self._with_depth(), strict=True):
             depth_view = self._views_of(view.frame, calibration)[1]
-            parts_mm += [part * 1000 for part in evidence.residuals_m(depth_view, blade)]
+            parts_mm += [part * 1000 for part in evidence.residuals_m(depth_view, blade, self._stance(view, self._p))]
         parts_px = [
-            found.residuals_px(self._views_of(view.frame, calibration)[0], blade)
+            found.residuals_px(self._views_of(view.frame, calibration)[0], blade, self._stance(view, self._p))
             for found, view in zip(self._color, self._views, strict=True)
         ]
         residual_mm = _robust_rms(np.concatenate(parts_mm)) if parts_mm else None
         edges = np.concatenate(parts_px) if parts_px else np.zeros(0)
         residual_px = _robust_rms(edges) if edges.size >= 10 * len(self._views) else None
         sigma = np.sqrt(np.diag(np.linalg.inv(self._information)))
-        uncertainty = dict(zip((*POSE, *GEOMETRY), map(float, sigma), strict=True))
+        uncertainty = dict(zip((*POSE, *GEOMETRY), map(float, sigma[:9]), strict=True))
         self._judge(residual_mm, residual_px, uncertainty)
+        self._compare_with_drawing(blade)
+        self._look_at_empty_bed(calibration, blade)
         calibration = calibration.model_copy(
             update={
                 "calibrated_at": when,
@@ -230,16 +271,44 @@ class _Solver:
             )
         if residual_mm is None and (residual_px is None or residual_px > MAX_RESIDUAL_PX):
             raise CalibrationError("the blade's outline does not fit the colour pictures; start nearer with --pose")
-        for evidence in self._depth:
+        for evidence, view in zip(self._depth, self._with_depth(), strict=True):
             if evidence.agreement < MIN_AGREEMENT:
                 raise CalibrationError(
-                    f"the frame at {evidence.angle_deg:+.1f} deg does not show the empty blade at that angle "
+                    f"the frame at {view.blade_angle_deg:+.1f} deg does not show the empty blade at that angle "
                     f"({evidence.agreement * 100:.0f} % of what stands there lies on it)"
                 )
         for name, value in uncertainty.items():
             limit = MAX_UNCERTAIN_DEG if name.endswith("_deg") else MAX_UNCERTAIN_MM / 1000
             if value > limit:
                 raise CalibrationError(f"{name} stays uncertain by {value:.3f}; take frames at more angles")
+
+    def _compare_with_drawing(self, blade: BladeGeometry) -> None:
+        for name in GEOMETRY:
+            drawn, found = float(getattr(self._blade, name)), float(getattr(blade, name))
+            if abs(found - drawn) > OFF_DRAWING_M:
+                raise CalibrationError(
+                    f"blade.{name} comes out as {found:.3f} m, {abs(found - drawn) * 1000:.0f} mm off the "
+                    f"{drawn:.3f} m configured; measure the blade and correct [blade], or the lifts' extension on the "
+                    "ground in [attitude]"
+                )
+
+    def _look_at_empty_bed(self, calibration: CameraCalibration, blade: BladeGeometry) -> None:
+        """Under what was solved, the bed of these very frames must be empty."""
+        settings = PerceptionSettings()
+        health = HealthMonitor(settings.health, blade, live=False)
+        for view in self._with_depth():
+            assert view.frame.depth_mm is not None  # those with depth
+            stance = self._stance(view, self._p)
+            judge = DepthJudge(self._views_of(view.frame, calibration)[1], blade, settings.depth, settings.decision)
+            soil = judge.height_map(view.frame.depth_mm, stance)
+            verdict = judge.verdict(soil)
+            faults = health.misplaced(soil, stance) or obstructed(soil)
+            if faults or verdict.zone is not Zone.NONE:
+                said = faults[0].detail if faults else f"{verdict.zone} ({verdict.reason})"
+                raise CalibrationError(
+                    f"with it, the empty bed at {view.blade_angle_deg:+.1f} deg would not be found empty: {said}; "
+                    "clear and level the ground before the blade"
+                )
 
 
 def _robust_rms(values: F64) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 from graderd.core.blade import BladeGeometry, blade_coordinates
 from graderd.hal.camera import DepthImage, Intrinsics, StreamPose
 from graderd.perception.geometry import F64, U8, View, blade_points_m, face_setback_m
+from graderd.perception.registration import Stance
 
 MAX_FACE_POINTS_N = 700
 MAX_GROUND_POINTS_N = 700
@@ -30,7 +31,6 @@ class DepthEvidence:
     ``agreement``: of the points anywhere near the face, the share that lie on it; low where the angle is wrong.
     """
 
-    angle_deg: float
     agreement: float
     face: F64
     ground: F64
@@ -38,15 +38,25 @@ class DepthEvidence:
     right_end: F64
     top: F64
 
-    def residuals_m(self, view: View, blade: BladeGeometry) -> list[F64]:
+    def residuals_m(self, view: View, blade: BladeGeometry, stance: Stance) -> list[F64]:
         """How far each group lies from where it belongs (m)."""
-        _, d, z = _in_blade(self.face, view, self.angle_deg)
-        face = d - blade.x_offset_m + face_setback_m(blade, z)
-        ground = _in_blade(self.ground, view, self.angle_deg)[2]
-        left = _in_blade(self.left_end, view, self.angle_deg)[0] - blade.length_m / 2
-        right = _in_blade(self.right_end, view, self.angle_deg)[0] + blade.length_m / 2
-        top = _in_blade(self.top, view, self.angle_deg)[2] - (blade.bottom_z_m + blade.height_m)
-        return [face, ground, left, right, top]
+        face = _off_face(*_in_blade(self.face, view, stance.angle_deg), blade, stance)
+        ground = _in_blade(self.ground, view, stance.angle_deg)[2]
+        left = _in_blade(self.left_end, view, stance.angle_deg)[0] - blade.length_m / 2
+        right = _in_blade(self.right_end, view, stance.angle_deg)[0] + blade.length_m / 2
+        s, _, z = _in_blade(self.top, view, stance.angle_deg)
+        return [face, ground, left, right, z - _edge_m(s, blade, stance) - stance.tall_m(blade)]
+
+
+def _edge_m(s: F64, blade: BladeGeometry, stance: Stance) -> F64:
+    """Height of the cutting edge along the blade."""
+    return np.asarray(stance.edge_m(blade) + stance.rise * s, dtype=np.float64)
+
+
+def _off_face(s: F64, d: F64, z: F64, blade: BladeGeometry, stance: Stance) -> F64:
+    """How far points lie ahead of the hollow face, standing or leaning."""
+    above_edge = z - _edge_m(s, blade, stance)
+    return d - blade.x_offset_m + face_setback_m(blade, above_edge + blade.bottom_z_m) - stance.lean * above_edge
 
 
 def _in_blade(points: F64, view: View, angle_deg: float) -> tuple[F64, F64, F64]:
@@ -63,29 +73,30 @@ def _optical_rays(lens: Intrinsics) -> F64:
 
 
 def collect_depth(
-    depth_mm: DepthImage, view: View, blade: BladeGeometry, angle_deg: float, band_m: float
+    depth_mm: DepthImage, view: View, blade: BladeGeometry, stance: Stance, band_m: float
 ) -> DepthEvidence:
     """Find the evidence in one depth picture, within ``band_m`` of where ``view`` and ``blade`` put it."""
     lens = view.lens
     rows, columns = np.nonzero(depth_mm)
     z_optical = depth_mm[rows, columns].astype(np.float64) / 1000.0
     points = _optical_rays(lens)[rows, columns] * z_optical[:, None]
-    s, d, z = _in_blade(points, view, angle_deg)
-    half, top = blade.length_m / 2, blade.bottom_z_m + blade.height_m
-    face = d - blade.x_offset_m + face_setback_m(blade, z)
+    angle_deg = stance.angle_deg
+    s, d, raw_z = _in_blade(points, view, angle_deg)
+    half, top = blade.length_m / 2, stance.tall_m(blade)
+    face = _off_face(s, d, raw_z, blade, stance)
+    z = raw_z - _edge_m(s, blade, stance)  # above the cutting edge
     on_face = np.abs(face) < band_m
-    before = (np.abs(s) < half - 0.02) & (z > blade.bottom_z_m + 0.03) & (z < top - 0.015)
+    before = (np.abs(s) < half - 0.02) & (z > 0.03) & (z < top - 0.015)
     body = on_face & before
     nearby = int(np.count_nonzero(before & (np.abs(face) < NEARBY_M)))
     agreement = np.count_nonzero(body) / nearby if nearby else 0.0
     clear = (np.abs(s) > half + 0.08) | (d > 0.12) | (d < -0.25)
-    ground = (np.abs(z) < band_m) & clear & (np.hypot(s, d) < 1.3)
+    ground = (np.abs(raw_z) < band_m) & clear & (np.hypot(s, d) < 1.3)
     wide = on_face & (np.abs(s) < half + band_m)
     # One pixel covers this much of the blade: an extreme point lies half of it inside the true end.
     pixel_m = float(np.median(z_optical[body])) / lens.fx if body.any() else 0.002
     left, right = _ends(points, s, z, wide, blade, 0.5 * pixel_m, view, angle_deg)
     return DepthEvidence(
-        angle_deg,
         float(agreement),
         _thinned(points[body], MAX_FACE_POINTS_N),
         _thinned(points[ground], MAX_GROUND_POINTS_N),
@@ -105,7 +116,7 @@ def _ends(
     grow_m: float, view: View, angle_deg: float,
 ) -> tuple[F64, F64]:  # fmt: skip
     """The outermost face points on both sides, per band of height; each moved outwards by half a pixel."""
-    lows = np.linspace(blade.bottom_z_m + 0.03, blade.bottom_z_m + blade.height_m - 0.02, ENDS_BANDS_N + 1)
+    lows = np.linspace(0.03, blade.height_m - 0.02, ENDS_BANDS_N + 1)
     along = blade_points_m(blade, angle_deg, np.array([1.0]), np.array([0.0]), np.array([0.0]))[0]
     along -= blade_points_m(blade, angle_deg, np.array([0.0]), np.array([0.0]), np.array([0.0]))[0]
     outwards = along @ view.rotation * grow_m
@@ -133,8 +144,10 @@ def _top(
         inside = np.flatnonzero(near & (s >= low) & (s < high))
         if inside.size < 40:
             continue
+        # Half of the topmost row of pixels: the very highest are those that noise has lifted.
+        rank = max(3, round(0.25 * (high - low) / grow_m))
         order = inside[np.argsort(z[inside])]
-        found.append(points[order[-3]] + up)
+        found.append(points[order[-min(rank, inside.size)]] + up)
     return np.reshape(found, (-1, 3))
 
 
@@ -142,17 +155,16 @@ def _top(
 class ColorEvidence:
     """Where edges were found near the blade's outline: for outline parameters, the pixel and the outline's normal."""
 
-    angle_deg: float
     side: np.ndarray[tuple[int, ...], np.dtype[np.int8]]
     share: F64
     at_px: F64
     normal: F64
 
-    def residuals_px(self, view: View, blade: BladeGeometry) -> F64:
+    def residuals_px(self, view: View, blade: BladeGeometry, stance: Stance) -> F64:
         """Distance along the normal between the found edges and the outline as ``view`` and ``blade`` put it (px)."""
         if len(self.at_px) == 0:
             return np.zeros(0)
-        there = view.project(_outline_m(blade, self.angle_deg, self.side, self.share))
+        there = view.project(_outline_m(blade, stance, self.side, self.share))
         return np.asarray(((there - self.at_px) * self.normal).sum(axis=1), dtype=np.float64)
 
 
@@ -160,24 +172,25 @@ TOP, LEFT_END, RIGHT_END = 0, 1, 2
 
 
 def _outline_m(
-    blade: BladeGeometry, angle_deg: float, side: np.ndarray[tuple[int, ...], np.dtype[np.int8]], share: F64
+    blade: BladeGeometry, stance: Stance, side: np.ndarray[tuple[int, ...], np.dtype[np.int8]], share: F64
 ) -> F64:
     """Points of the face's outline: upper edge (share from right to left), the ends (share from bottom to top)."""
-    half, low = blade.length_m / 2, blade.bottom_z_m
+    half, tall = blade.length_m / 2, stance.tall_m(blade)
     s = np.where(side == TOP, (2 * share - 1) * half, np.where(side == LEFT_END, half, -half))
-    z = np.where(side == TOP, low + blade.height_m, low + share * blade.height_m)
-    return blade_points_m(blade, angle_deg, s, -face_setback_m(blade, z), z)
+    above_edge = np.where(side == TOP, tall, share * tall)
+    d = stance.lean * above_edge - face_setback_m(blade, above_edge + blade.bottom_z_m)
+    return blade_points_m(blade, stance.angle_deg, s, d, _edge_m(s, blade, stance) + above_edge)
 
 
-def collect_color(color_bgr: U8, view: View, blade: BladeGeometry, angle_deg: float, band_m: float) -> ColorEvidence:
+def collect_color(color_bgr: U8, view: View, blade: BladeGeometry, stance: Stance, band_m: float) -> ColorEvidence:
     """Find the outline's edges in one colour picture, within ``band_m`` (at the blade) of where it should be."""
     gray = cv2.GaussianBlur(cv2.cvtColor(color_bgr, cv2.COLOR_BGR2GRAY), (0, 0), 1.2).astype(np.float32)
     share = np.linspace(0.04, 0.96, EDGE_POINTS_N)
     side = np.repeat(np.array([TOP, LEFT_END, RIGHT_END], dtype=np.int8), EDGE_POINTS_N)
     shares = np.tile(share, 3)
     shares[EDGE_POINTS_N:] = np.tile(np.linspace(0.35, 0.95, EDGE_POINTS_N), 2)  # soil and shade hide the ends' feet
-    at = view.project(_outline_m(blade, angle_deg, side, shares))
-    nearby = view.project(_outline_m(blade, angle_deg, side, shares + 0.01))
+    at = view.project(_outline_m(blade, stance, side, shares))
+    nearby = view.project(_outline_m(blade, stance, side, shares + 0.01))
     tangent = nearby - at
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
     normal = np.column_stack((-tangent[:, 1], tangent[:, 0]))
@@ -198,4 +211,4 @@ def collect_color(color_bgr: U8, view: View, blade: BladeGeometry, angle_deg: fl
     shift = np.clip(0.5 * (a - c) / np.maximum(a - 2 * b + c, -1e9).clip(max=-1e-6), -0.5, 0.5)
     offset = offsets[1 + peak] + shift
     found = at[index] + normal[index] * offset[:, None]
-    return ColorEvidence(angle_deg, side[index], shares[index], found, normal[index])
+    return ColorEvidence(side[index], shares[index], found, normal[index])

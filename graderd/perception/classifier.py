@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import PictureFault, SoilAhead, SoilObservation, Thirds, Zone
 from graderd.hal.camera import Frame, Intrinsics
@@ -20,7 +21,8 @@ from graderd.perception.color import fast_color_verdict, paper_verdict
 from graderd.perception.decide import Verdict, fuse
 from graderd.perception.depth import DepthJudge, HeightMap
 from graderd.perception.geometry import CENTER, LEFT, RIGHT, U8, Region, View, blade_region, image_thirds
-from graderd.perception.health import HealthMonitor, KnockWatch
+from graderd.perception.health import DepthWatch, HealthMonitor, obstructed
+from graderd.perception.registration import Stance
 from graderd.perception.settings import (
     CameraCalibration,
     ColorSettings,
@@ -39,9 +41,16 @@ KEPT_REGIONS_N = 64
 class Classifier(Protocol):
     """Says where the soil lies. Holds state (the frame before): one instance per stream of frames, one thread."""
 
-    def classify(self, frame: Frame, blade_angle_deg: float, blade_angle_age_s: float) -> SoilObservation:
+    def classify(
+        self,
+        frame: Frame,
+        blade_angle_deg: float,
+        blade_angle_age_s: float,
+        attitude: MeasuredAttitude = UNMEASURED,
+    ) -> SoilObservation:
         """Judge one frame with the thirds laid at ``blade_angle_deg``, measured ``blade_angle_age_s`` before capture.
 
+        ``attitude``: height, cross slope and pitch of the blade, as far as its lifts and its tilt are measured.
         Never raises for what a picture shows: a bad picture gives zone UNKNOWN and names its faults.
         """
         ...
@@ -80,26 +89,32 @@ class SoilClassifier:
         self._calibration = calibration
         self._mounting = calibration.mounting if calibration is not None else mounting
         self._blade = blade
-        self._health = HealthMonitor(settings.health, live, camera)
+        self._health = HealthMonitor(settings.health, blade, live, camera)
         self._views: dict[tuple[str, Intrinsics], View] = {}
         self._judges: dict[Intrinsics, DepthJudge] = {}
         self._regions: OrderedDict[tuple[object, ...], Region | None] = OrderedDict()
         # Stills have nothing to do with each other, and a look at one in ten says nothing about the next.
-        self._knock = KnockWatch(self._knocked) if live else None
+        self._watch = DepthWatch() if live else None
 
     @property
     def settings(self) -> PerceptionSettings:
         """The settings it was made with."""
         return self._settings
 
-    def classify(self, frame: Frame, blade_angle_deg: float, blade_angle_age_s: float) -> SoilObservation:
+    def classify(
+        self,
+        frame: Frame,
+        blade_angle_deg: float,
+        blade_angle_age_s: float,
+        attitude: MeasuredAttitude = UNMEASURED,
+    ) -> SoilObservation:
         """See :class:`Classifier`."""
         start_s = time.thread_time()
         method = self._settings.method
-        faults = self._health.check(frame, needs_depth=method in ("depth", "fused"))
+        faults = self._health.check(frame, needs_depth=method in ("depth", "fused"), needs_color=method != "depth")
         judged = _Judged(Verdict(Zone.UNKNOWN, 0.0, ""))
         if not faults:
-            judged, more = self._judge(frame, blade_angle_deg)
+            judged, more = self._judge(frame, Stance(blade_angle_deg, attitude))
             faults += more
         if faults:
             judged = judged.unknown("; ".join(f"{fault.condition}: {fault.detail}" for fault in faults))
@@ -126,12 +141,12 @@ class SoilClassifier:
         height, width = frame.depth_mm.shape
         return self._view("depth", frame.depth_intrinsics, width, height)
 
-    def height_map(self, frame: Frame, blade_angle_deg: float) -> HeightMap | None:
+    def height_map(self, frame: Frame, stance: Stance) -> HeightMap | None:
         """The soil's height map of a frame, for pictures and studies; None where the frame or calibration has none."""
         judge = self._depth_judge(frame)
         if judge is None or frame.depth_mm is None:
             return None
-        return judge.height_map(frame.depth_mm, blade_angle_deg)
+        return judge.height_map(frame.depth_mm, stance)
 
     def _view(self, stream: str, lens: Intrinsics | None, width: int, height: int) -> View | None:
         if self._calibration is None:
@@ -174,38 +189,46 @@ class SoilClassifier:
             self._judges[view.lens] = DepthJudge(view, self._blade, self._settings.depth, self._settings.decision)
         return self._judges[view.lens]
 
-    def _judge(self, frame: Frame, angle_deg: float) -> tuple[_Judged, list[PictureFault]]:
+    def _judge(self, frame: Frame, stance: Stance) -> tuple[_Judged, list[PictureFault]]:
         settings = self._settings
-        region = self._region(frame, angle_deg)
-        if region is None:
-            reason = "the blade is not in the picture at this angle, or the picture is too small"
-            return _Judged(Verdict(Zone.UNKNOWN, 0.0, reason)), []
-        faults = self._health.blurred(frame.color_bgr, region)
-        if faults:
-            return _Judged(Verdict(Zone.UNKNOWN, 0.0, "")), faults
+        region: Region | None = None
+        if self._health.lit:
+            region = self._region(frame, stance.angle_deg)
+            if region is None:
+                reason = "the blade is not in the picture at this angle, or the picture is too small"
+                return _Judged(Verdict(Zone.UNKNOWN, 0.0, reason)), []
+            faults = self._health.blurred(frame.color_bgr, region)
+            if faults:
+                return _Judged(Verdict(Zone.UNKNOWN, 0.0, "")), faults
         by_color = BY_COLOR.get(settings.method)
         if by_color is not None:
+            assert region is not None  # an unlit picture is a fault where colour is needed
             verdict = by_color(frame.color_bgr, region, settings.color, settings.decision)
-            return _Judged(self._said(frame, verdict)), self._knocked_meanwhile(frame, angle_deg)
+            return _Judged(self._said(frame, verdict)), self._seen_meanwhile(frame, stance)
         judge = self._depth_judge(frame)
         if judge is None or frame.depth_mm is None:
             return _Judged(Verdict(Zone.UNKNOWN, 0.0, "no calibration of the depth picture applies")), []
-        soil = judge.height_map(frame.depth_mm, angle_deg)
+        soil = judge.height_map(frame.depth_mm, stance)
         by_depth, ahead = judge.verdict(soil), judge.verdict_ahead(soil)
-        faults = self._knocked(soil)
-        if settings.method == "depth" or faults:
+        faults = self._seen(soil, stance)
+        if region is None or settings.method == "depth" or faults:
             return _Judged(by_depth, ahead, soil.carried_l), faults
         cross_check = fast_color_verdict(frame.color_bgr, region, settings.color, settings.decision)
         # Colour cannot tell ahead from carried: what it sees before the blade objects to either.
         return _Judged(fuse(by_depth, cross_check), fuse(ahead, cross_check), soil.carried_l), []
 
-    def _knocked(self, soil: HeightMap) -> list[PictureFault]:
-        return self._health.knocked(soil.ground, soil.blade, self._settings.depth)
+    def _seen(self, soil: HeightMap, stance: Stance) -> list[PictureFault]:
+        return self._health.misplaced(soil, stance) or obstructed(soil)
 
-    def _knocked_meanwhile(self, frame: Frame, angle_deg: float) -> list[PictureFault]:
-        if self._knock is None:
+    def _seen_meanwhile(self, frame: Frame, stance: Stance) -> list[PictureFault]:
+        if self._watch is None:
             return []
-        return self._knock.check(lambda: self.height_map(frame, angle_deg))
+
+        def look() -> list[PictureFault]:
+            soil = self.height_map(frame, stance)
+            return self._seen(soil, stance) if soil is not None else []
+
+        return self._watch.check(look)
 
     def _said(self, frame: Frame, verdict: Verdict) -> Verdict:
         if self.color_view(frame) is not None:
@@ -285,6 +308,7 @@ def judge_frame(
     blade_angle_age_s: float,
     now_s: float,
     settings: DecisionSettings,
+    attitude: MeasuredAttitude = UNMEASURED,
 ) -> SoilObservation:
     """The observation of one frame, with an old one never judged.
 
@@ -306,4 +330,4 @@ def judge_frame(
             frame_number=frame.color_number,
             faults=(PictureFault("stale", detail),),
         )
-    return classifier.classify(frame, blade_angle_deg, angle_age_s)
+    return classifier.classify(frame, blade_angle_deg, angle_age_s, attitude)

@@ -8,8 +8,10 @@
     camera.json                       lens and pose of each stream in the vehicle frame, and the blade
 
 ``manifest.csv`` begins with the columns ``id,label,blade_angle_deg,vol_left_l,vol_center_l,vol_right_l``; ``id`` is the
-NNN of the file names; ``label`` is left, center, right, even, none or unknown, or empty; volumes may be empty. Further
-columns are carried through. ``camera.json``: pixel centres at integers; ``rotation_vehicle_from_optical`` row-major,
+NNN of the file names; ``label`` is left, center, right, even, none or unknown, or empty; volumes may be empty. The
+columns ``blade_height_mm,blade_slope_deg,blade_pitch_deg``, which may be missing or empty, give the blade's attitude as
+its lifts and its tilt measured it. Further columns are carried through. ``camera.json``: pixel centres at integers;
+``rotation_vehicle_from_optical`` row-major,
 its columns the optical axes (X right, Y down, Z along the view) in the vehicle frame (x forward, y left, z up, metres,
 origin at the blade's rotation axis on the ground); ``p_vehicle = rotation @ p_optical + position_m``. The block
 ``depth`` and the ``*.depth.png`` may be missing.
@@ -30,6 +32,7 @@ import cv2
 import numpy as np
 from pydantic import ValidationError
 
+from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Zone
 from graderd.hal.camera import ColorImage, DepthImage, EndOfFrames, Frame, Intrinsics, StreamPose
@@ -40,6 +43,7 @@ from graderd.perception.settings import CameraCalibration, Mounting, StreamCalib
 MANIFEST = "manifest.csv"
 CAMERA = "camera.json"
 COLUMNS = ("id", "label", "blade_angle_deg", "vol_left_l", "vol_center_l", "vol_right_l")
+ATTITUDE_COLUMNS = ("blade_height_mm", "blade_slope_deg", "blade_pitch_deg")
 MAX_ROTATION_ERROR = 1e-3
 
 
@@ -53,6 +57,7 @@ class Entry:
     vol_left_l: float | None = None
     vol_center_l: float | None = None
     vol_right_l: float | None = None
+    attitude: MeasuredAttitude = UNMEASURED
     extra: dict[str, str] = field(default_factory=dict)
 
 
@@ -162,8 +167,9 @@ def _entry(row: Mapping[str, str], where: str) -> Entry:
     if angle is None:
         raise ProtocolError(where, "blade_angle_deg is empty")
     left, center, right = (_number(row, column, where) for column in COLUMNS[3:])
-    extra = {key: value for key, value in row.items() if key not in COLUMNS}
-    return Entry(name, label, angle, left, center, right, extra)
+    extra = {key: value for key, value in row.items() if key not in (*COLUMNS, *ATTITUDE_COLUMNS)}
+    attitude = MeasuredAttitude(*(_number(row, column, where) for column in ATTITUDE_COLUMNS))
+    return Entry(name, label, angle, left, center, right, attitude, extra)
 
 
 def _number(row: Mapping[str, str], column: str, where: str) -> float | None:
@@ -271,7 +277,7 @@ class FrameSetWriter:
         self._camera = camera_json(calibration, blade)
         (folder / CAMERA).write_text(json.dumps(self._camera, indent=1) + "\n", encoding="utf-8")
         with (folder / MANIFEST).open("w", encoding="utf-8", newline="") as file:
-            csv.writer(file).writerow((*COLUMNS, *extra_columns))
+            csv.writer(file).writerow((*COLUMNS, *ATTITUDE_COLUMNS, *extra_columns))
 
     def add(self, entry: Entry, frame: Frame) -> None:
         """Write one frame's pictures (PNG) and its line."""
@@ -281,6 +287,8 @@ class FrameSetWriter:
         volumes = (entry.vol_left_l, entry.vol_center_l, entry.vol_right_l)
         row = [entry.id, entry.label or "", f"{entry.blade_angle_deg:.3f}"]
         row += ["" if volume is None else f"{volume:.3f}" for volume in volumes]
+        attitude = (entry.attitude.height_mm, entry.attitude.slope_deg, entry.attitude.pitch_deg)
+        row += ["" if value is None else f"{value:.2f}" for value in attitude]
         row += [entry.extra.get(column, "") for column in self._extra]
         with (self._folder / MANIFEST).open("a", encoding="utf-8", newline="") as file:
             csv.writer(file).writerow(row)

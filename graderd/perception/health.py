@@ -12,13 +12,14 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from graderd.core.blade import BladeGeometry
 from graderd.core.soil import PictureFault
 from graderd.hal.camera import Frame
 from graderd.hal.settings import CameraSettings
 from graderd.perception.depth import HeightMap
 from graderd.perception.geometry import F32, U8, Region
-from graderd.perception.registration import BladeFix, Ground
-from graderd.perception.settings import DepthSettings, HealthSettings
+from graderd.perception.registration import Stance
+from graderd.perception.settings import HealthSettings
 
 SAMPLE_STEP_PX = (16, 12)
 """Rows and columns: a row costs a walk through memory, a pixel of it hardly anything."""
@@ -30,26 +31,36 @@ CLIPPED_GRAY = 250
 BLUR_ROWS_N = 9
 BLUR_MIN_CONTRAST = 64.0
 """Square grey levels of four summed pixels."""
-GROUND_AT_M = (0.2, 0.0)
-"""Where the ground's level is compared: before the blade."""
 
 
 class HealthMonitor:
     """Judges pictures one after the other; one instance per stream of frames."""
 
-    def __init__(self, settings: HealthSettings, live: bool, camera: CameraSettings | None = None) -> None:
+    def __init__(
+        self, settings: HealthSettings, blade: BladeGeometry, live: bool, camera: CameraSettings | None = None
+    ) -> None:
+        self._blade = blade
         self._settings = settings
         self._asked = (camera.color_width_px, camera.color_height_px) if camera is not None else None
         self._live = live
         self._last_sample: bytes = b""
         self._last_size: tuple[int, ...] = ()
         self._same_n = 0
+        self.lit = True
+        """Whether the newest colour picture shows enough to be judged as a picture."""
 
-    def check(self, frame: Frame, needs_depth: bool) -> list[PictureFault]:
-        """What is wrong with the picture as such, before anything is measured in it."""
+    def check(self, frame: Frame, needs_depth: bool, needs_color: bool) -> list[PictureFault]:
+        """What is wrong with the picture as such, before anything is measured in it.
+
+        Depth brings its own light: where colour is not needed, its darkness or glare is no fault.
+        """
         faults = self._size(frame)
         sample = np.ascontiguousarray(frame.color_bgr[:: SAMPLE_STEP_PX[0], :: SAMPLE_STEP_PX[1]])
-        faults += self._light(sample)
+        self.lit = True
+        light = self._light(sample)
+        if not needs_color and light and light[0].condition in ("black", "blown_out"):
+            self.lit, light = False, []
+        faults += light
         faults += self._frozen(frame, sample)
         faults += self._torn(frame)
         if needs_depth:
@@ -142,21 +153,43 @@ class HealthMonitor:
             return [PictureFault("blurred", detail)]
         return []
 
-    def knocked(self, ground: Ground, blade: BladeFix, depth: DepthSettings) -> list[PictureFault]:
-        """Whether ground and blade were found so far from the calibration that the camera must have been moved."""
-        reasons = []
-        offset_m = ground.offset_under_m(*GROUND_AT_M)
-        if abs(offset_m) > depth.ground_offset_limit_m:
-            reasons.append(f"ground {offset_m * 1000:+.0f} mm off")
-        if ground.slope_deg() > depth.ground_slope_limit_deg:
-            reasons.append(f"ground tilted by {ground.slope_deg():.1f} deg")
-        if max(abs(blade.ahead_m), abs(blade.along_m)) > self._settings.knocked_mm / 1000:
-            reasons.append(f"blade {blade.ahead_m * 1000:+.0f} mm ahead, {blade.along_m * 1000:+.0f} mm along")
-        if abs(blade.turn_deg) > self._settings.knocked_deg:
-            reasons.append(f"blade turned by {blade.turn_deg:+.1f} deg")
-        if blade.missing * 100 > self._settings.knocked_missing_percent:
-            reasons.append(f"{blade.missing * 100:.0f} % of the blade is not where it should be")
-        return [PictureFault("knocked", ", ".join(reasons) + " against the calibration")] if reasons else []
+    def misplaced(self, soil: HeightMap, stance: Stance) -> list[PictureFault]:
+        """Whether the camera was moved, or the blade is not where its measured angle and lifts say.
+
+        The camera was moved where blade and ground moved together, or where the blade's axis, which cannot move, did. A
+        ground that tilts under a blade in its place is a slope; a blade that is turned about its axis, or higher than
+        its lifts say over ground in its place, is a blade that moved.
+        """
+        settings, fix, ground = self._settings, soil.blade, soil.ground
+        axis_m = float(np.hypot(fix.ahead_m, fix.along_m))
+        moved: list[str] = []
+        elsewhere: list[str] = []
+        if max(abs(fix.ahead_m), abs(fix.along_m)) > settings.knocked_mm / 1000:
+            moved.append(f"blade {fix.ahead_m * 1000:+.0f} mm ahead, {fix.along_m * 1000:+.0f} mm along")
+        if abs(fix.turn_deg) > settings.knocked_deg:
+            turned = f"blade turned by {fix.turn_deg:+.1f} deg"
+            (moved if axis_m > settings.knocked_axis_mm / 1000 else elsewhere).append(turned)
+        if fix.missing * 100 > settings.knocked_missing_percent:
+            moved.append(f"{fix.missing * 100:.0f} % of the blade is not where it should be")
+        offset_m = float(ground.height_at(np.zeros(1), np.zeros(1))[0])
+        level = abs(offset_m) < settings.knocked_ground_mm / 1000 and ground.slope_deg() < settings.knocked_ground_deg
+        if soil.edge is None:
+            if abs(offset_m) > settings.knocked_ground_mm / 1000:
+                moved.append(f"ground {offset_m * 1000:+.0f} mm off")
+        else:
+            up_m = soil.edge.height_m - stance.edge_m(self._blade) - stance.tall_m(self._blade)
+            tilted_deg = float(np.degrees(soil.edge.rise - stance.rise))
+            said = f"edge {up_m * 1000:+.0f} mm up, tilted by {tilted_deg:+.1f} deg"
+            off = abs(up_m) > settings.knocked_ground_mm / 1000 or abs(tilted_deg) > settings.knocked_deg / 2
+            if not level and off and abs(offset_m - up_m) < settings.knocked_axis_mm / 1000:
+                moved.append(f"{said}, and the ground with it (tilted by {ground.slope_deg():.1f} deg)")
+            elif stance.attitude.height_mm is not None and abs(up_m) > settings.knocked_mm / 1000:
+                elsewhere.append(said)
+        if moved:
+            return [PictureFault("knocked", ", ".join(moved) + " against the calibration")]
+        if elsewhere:
+            return [PictureFault("blade_elsewhere", ", ".join(elsewhere) + " against what is measured")]
+        return []
 
 
 def flat_share(gray: U8) -> float:
@@ -203,25 +236,30 @@ def _square_difference(lines: F32, distance: int) -> F32:
     return np.asarray(np.einsum("ij,ij->i", difference, difference) / difference.shape[1], dtype=np.float32)
 
 
+def obstructed(soil: HeightMap) -> list[PictureFault]:
+    """Whether something stands upright before the face, as a person's leg does and no soil."""
+    if soil.standing_at_m is None:
+        return []
+    s, d = soil.standing_at_m
+    side = "left" if s > 0 else "right"
+    detail = f"something stands {d * 100:.0f} cm ahead of the blade, {abs(s) * 100:.0f} cm {side} of its middle"
+    return [PictureFault("obstructed", detail)]
+
+
 CHECK_EVERY_N = 10
-"""At 30 frames a second the blade is looked for three times a second."""
+"""At 30 frames a second the depth picture is looked at three times a second."""
 
 
-class KnockWatch:
-    """Looks now and then whether the blade is where it should be; one instance per stream of frames."""
+class DepthWatch:
+    """Looks now and then at the depth picture under a colour method; one instance per stream of frames."""
 
-    def __init__(self, of_height_map: Callable[[HeightMap], list[PictureFault]]) -> None:
-        self._of_height_map = of_height_map
+    def __init__(self) -> None:
         self._frame_n = 0
         self._faults: list[PictureFault] = []
 
-    def check(self, height_map: Callable[[], HeightMap | None]) -> list[PictureFault]:
-        """The fault ``knocked`` as long as the last look found the camera moved.
-
-        ``height_map`` measures the frame's depth picture (None where it has none); called only when it is time to look.
-        """
+    def check(self, look: Callable[[], list[PictureFault]]) -> list[PictureFault]:
+        """The faults that the last look found; ``look`` is called only when it is time to."""
         if self._frame_n % CHECK_EVERY_N == 0:
-            soil = height_map()
-            self._faults = self._of_height_map(soil) if soil is not None else []
+            self._faults = look()
         self._frame_n += 1
         return list(self._faults)

@@ -79,28 +79,45 @@ class ColorSettings(Settings):
         return low, high
 
 
+class FormSettings(Settings):
+    """What has the form of soil, and what does not."""
+
+    steepest_deg: Annotated[float, Field(gt=0, lt=89)] = Field(
+        default=60.0, description="what rises steeper out of what lies beside it is no soil"
+    )
+    steep_spread_m: Positive = Field(
+        default=0.0105, description="heights in cells in a row spread more than this: steep (soil at 45 deg: 6 mm)"
+    )
+    thing_core_percent: Percent = Field(
+        default=20.0, description="a lump with less than this clear of steep cells is no soil"
+    )
+    thing_largest_l: Positive = Field(
+        default=7.0,
+        description="more than this without the form of soil is soil seen badly, or a heap of things: unknown",
+    )
+    lowest_m: Positive = Field(default=0.006, description="what is lower than this is ground")
+
+
 class DepthSettings(Settings):
     """The depth rule: soil height above a ground that is fitted anew in every frame."""
 
     stride_px: int = Field(default=5, ge=1, le=16, description="every n-th row and column is used, at 848 across")
     cell_m: Positive = Field(default=0.02, le=0.1, description="size of a cell of the height map in blade coordinates")
-    baseline_m: Positive = Field(default=0.095, description="stereo baseline of the D455, for the expected noise")
-    disparity_noise_px: Positive = Field(default=0.08, description="rms disparity error of the D455 family")
     noise_factor_ratio: Positive = Field(
-        default=4.0, description="soil must stand this many times above the measured noise"
+        default=4.0, description="soil must stand out by this many times the ground's unevenness and noise"
     )
-    min_height_m: Positive = Field(default=0.012, description="and at least this high")
-    max_height_m: Positive = Field(default=0.34, description="what stands higher than this is machine, not soil")
-    steepest_deg: Annotated[float, Field(gt=0, lt=89)] = Field(
-        default=60.0, description="what rises steeper is no soil"
-    )
+    min_height_m: Positive = Field(default=0.012, description="and by at least this")
+    max_height_m: Positive = Field(default=0.34, description="what is higher than this is no part of a heap")
     repose_deg: Annotated[float, Field(gt=0, lt=80)] = Field(
-        default=33.0, description="slope given to hidden back faces"
+        default=30.0, description="slope given to hidden back faces"
     )
     ground_offset_limit_m: Positive = Field(
-        default=0.055, description="fitted ground further off the calibrated one: knocked"
+        default=0.055, description="ground is looked for so far above and below the calibrated one"
     )
-    ground_slope_limit_deg: Positive = Field(default=3.4, description="fitted ground tilted more than this: knocked")
+    ground_slope_limit_deg: Positive = Field(
+        default=8.0, description="ground tilted more than this is not judged (14 %)"
+    )
+    form: FormSettings = Field(default_factory=FormSettings)
     min_valid_percent: Percent = Field(default=35.0, description="less depth than this in front of the blade: unknown")
     none_volume_l: Positive = Field(default=1.2, description="less soil than this in front of the whole blade: none")
     ahead_min_percent: Percent = Field(
@@ -141,6 +158,15 @@ class HealthSettings(Settings):
         default=75.0, description="blade found further than this from where it should be: knocked"
     )
     knocked_deg: Positive = Field(default=4.0, description="blade found turned by more than this: knocked")
+    knocked_axis_mm: Positive = Field(
+        default=30.0, description="the blade's axis or edge further than this from its place: not the blade moved alone"
+    )
+    knocked_ground_mm: Positive = Field(
+        default=55.0, description="ground further than this off the calibrated one, and the blade with it: knocked"
+    )
+    knocked_ground_deg: Positive = Field(
+        default=3.4, description="ground tilted by more than this, and the blade with it: knocked"
+    )
     knocked_missing_percent: Percent = Field(
         default=30.0, description="so much of the blade's face is not there: knocked"
     )
@@ -152,7 +178,7 @@ class HealthSettings(Settings):
 class PerceptionSettings(Settings):
     """Section ``[perception]`` of the configuration file."""
 
-    method: Method = "fused"
+    method: Method = "depth"
     color: ColorSettings = Field(default_factory=ColorSettings)
     depth: DepthSettings = Field(default_factory=DepthSettings)
     decision: DecisionSettings = Field(default_factory=DecisionSettings)

@@ -10,6 +10,7 @@ from typing import Protocol
 
 from graderd.config import Config
 from graderd.core import commands as cmd
+from graderd.core.attitude import MeasuredAttitude
 from graderd.core.machine import ARMED, Mode, State
 from graderd.core.plausibility import motion_figures
 from graderd.core.soil import SoilObservation
@@ -39,8 +40,8 @@ class Eyes(Protocol):
         """What is wrong with camera and picture."""
         ...
 
-    def send_angle(self, angle_deg: float, time_s: float) -> None:
-        """Tell perception the measured angle."""
+    def send_angle(self, angle_deg: float, time_s: float, attitude: MeasuredAttitude) -> None:
+        """Tell perception the measured angle, and the attitude as far as it is known."""
         ...
 
 
@@ -216,7 +217,7 @@ class ControlLoop:
             self._tell(axis, decided)
         angle = self.sensed.axes["rotation"].telemetry.position
         if angle is not None and angle.valid:
-            self._eyes.send_angle(angle.value, angle.time_s)
+            self._eyes.send_angle(angle.value, angle.time_s, tick.attitude)
 
     def _tell(self, axis: str, decided: AxisTick) -> None:
         if decided.send is None:

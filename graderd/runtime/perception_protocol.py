@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import SoilObservation
 from graderd.hal.settings import AnyCameraSettings
@@ -37,11 +38,19 @@ class Start(_Message):
 
 
 class Angle(_Message):
-    """The measured blade angle and its monotonic time."""
+    """The measured blade angle and its monotonic time; with it the blade's attitude, as far as it is measured."""
 
     kind: Literal["angle"] = "angle"
     angle_deg: float
     time_s: float
+    height_mm: float | None = None
+    slope_deg: float | None = None
+    pitch_deg: float | None = None
+
+    @property
+    def attitude(self) -> MeasuredAttitude:
+        """Height, cross slope and pitch together."""
+        return MeasuredAttitude(self.height_mm, self.slope_deg, self.pitch_deg)
 
 
 class PreviewRequest(_Message):

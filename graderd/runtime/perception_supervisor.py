@@ -12,10 +12,12 @@ import contextlib
 import logging
 import sys
 from collections import deque
+from dataclasses import asdict
 from pathlib import Path
 
 from pydantic import BaseModel
 
+from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import SoilObservation
 from graderd.core.status import CameraStatus
@@ -159,9 +161,9 @@ class PerceptionSupervisor:
     def _is_stale(self) -> bool:
         return self._clock.now_s() - self._no_frame_since_s > self._camera.stale_s
 
-    def send_angle(self, angle_deg: float, time_s: float) -> None:
-        """Tell the child the measured blade angle; dropped while the child does not read."""
-        self._write(Angle(angle_deg=angle_deg, time_s=time_s))
+    def send_angle(self, angle_deg: float, time_s: float, attitude: MeasuredAttitude) -> None:
+        """Tell the child the measured blade angle and attitude; dropped while the child does not read."""
+        self._write(Angle(angle_deg=angle_deg, time_s=time_s, **asdict(attitude)))
 
     async def preview_jpeg(self, timeout_s: float = 3.0) -> bytes:
         """The next frame's annotated picture.

@@ -25,15 +25,19 @@ _EDGE_STEP_PX = 0.9
 """A jump in disparity between neighbours above which matching fails."""
 
 
+NOISE_GRAIN_PX = 2.5
+"""Matching windows overlap: pixels this near err together."""
+
+
 class StereoNoise:
     """Turns true depth into measured depth. Its fields of noise and holes are made once and cut anew for each frame."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         shape = (613, 1103)
         white = rng.standard_normal(shape, np.float32)
-        smooth = np.asarray(cv2.GaussianBlur(white, (0, 0), 1.2), np.float32)
+        smooth = np.asarray(cv2.GaussianBlur(white, (0, 0), NOISE_GRAIN_PX), np.float32)
         smooth /= float(smooth.std())
-        mixed = 0.8 * smooth + 0.6 * white
+        mixed = 0.9 * smooth + 0.44 * white
         self._noise = np.asarray(mixed / mixed.std(), np.float32)
         blobs = noise(rng, shape, ((5.0, 1.0), (11.0, 0.8)))
         ranks = np.argsort(np.argsort(blobs, axis=None)).reshape(shape)

@@ -221,17 +221,34 @@ def blade_grid(field: SoilField, window: Window, x_m: float, angle_deg: float) -
     return across * cos - along * sin, across * sin + along * cos
 
 
+def hollow_m2(height_m: FloatArray) -> FloatArray:
+    """Area between the hollow face and the plane of its two edges, from the cutting edge up to these heights."""
+    half = FACE_HEIGHT_M / 2.0
+    t = np.clip(height_m, 0.0, FACE_HEIGHT_M) - half
+
+    def under_arc(t: FloatArray) -> FloatArray:
+        root = np.sqrt(CURVATURE_RADIUS_M**2 - t**2)
+        return np.asarray((t * root + CURVATURE_RADIUS_M**2 * np.arcsin(t / CURVATURE_RADIUS_M)) / 2.0)
+
+    chord = math.sqrt(CURVATURE_RADIUS_M**2 - half**2)
+    return np.asarray(under_arc(t) - under_arc(np.asarray(-half)) - (t + half) * chord)
+
+
 def volumes_in_front_m3(field: SoilField, x_m: float, angle_deg: float) -> tuple[float, float, float]:
     """Soil in front of the blade per third of its length: left, center, right (the operator's), cubic metres.
 
-    Counted from the face to ``REACH_M`` ahead of it; the thirds are blade coordinates and turn with the blade.
+    Counted from the hollow face to ``REACH_M`` ahead of its edges; the thirds are blade coordinates and turn with the
+    blade. Soil fills the hollow as high as it stands just before it.
     """
     span = LENGTH_M / 2.0 + REACH_M
     window = field.window(x_m - span, x_m + span, -span, span)
     s_m, d_m = blade_grid(field, window, x_m, angle_deg)
-    heights = np.where((d_m >= 0.0) & (d_m <= REACH_M), field.heights_m[window.slices], 0.0)
+    soil = field.heights_m[window.slices]
     third = LENGTH_M / 6.0
     cell = field.cell_m**2
+    touching = (d_m >= 0.0) & (d_m < field.cell_m)
+    hollow = np.where(touching, hollow_m2(soil) / field.cell_m, 0.0)
+    heights = np.where((d_m >= 0.0) & (d_m <= REACH_M), soil, 0.0) + hollow
     left = float(heights[(s_m > third) & (s_m <= LENGTH_M / 2.0)].sum()) * cell
     center = float(heights[np.abs(s_m) <= third].sum()) * cell
     right = float(heights[(s_m < -third) & (s_m >= -LENGTH_M / 2.0)].sum()) * cell

@@ -54,7 +54,7 @@ def test_the_thirds_turn_with_the_blade(method: Method) -> None:
     assert classifier.classify(frame, 45.0, 0.0).zone is Zone.LEFT
     # The same picture judged at a wrong angle: the thirds lie elsewhere, so the shares do too.
     elsewhere = classifier.classify(frame, 0.0, 0.0)
-    assert elsewhere.share_left < 0.9
+    assert elsewhere.zone is Zone.UNKNOWN or elsewhere.share_left < 0.9
 
 
 @pytest.mark.parametrize("method", METHODS)

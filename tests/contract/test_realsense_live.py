@@ -19,6 +19,7 @@ from graderd.hal.errors import (
     WrongDeviceError,
 )
 from graderd.hal.settings import CameraSettings
+from graderd.runtime.app.perception_child import settings_not_kept
 from harness.realsense_devices import SoftD455
 
 PERIOD_S = 1 / 30
@@ -177,6 +178,42 @@ def test_exposure_and_white_balance_are_set_locked_and_read_back() -> None:
     beyond.open()
     assert beyond.settings_read_back()["exposure_us"] == 1_000_000.0  # what was really set is what is told
     beyond.close()
+
+
+def test_the_depth_sensor_is_set_and_read_back_too() -> None:
+    rs = sdk.load()
+    soft = SoftD455()
+    for which, low, high, default in (
+        (rs.option.visual_preset, 0, 5, 0),
+        (rs.option.emitter_enabled, 0, 2, 0),
+        (rs.option.laser_power, 0, 360, 0),
+        (rs.option.enable_auto_exposure, 0, 1, 1),
+        (rs.option.exposure, 1, 200_000, 8500),
+        (rs.option.gain, 16, 248, 16),
+    ):
+        span = rs.option_range()
+        span.min, span.max, span.default, span.step = low, high, default, 1
+        soft.depth_sensor.add_option(which, span, True)
+    wanted = settings(depth_preset="high_accuracy", depth_laser_mw=240, depth_exposure_us=4000)
+    camera = RealSenseCamera(wanted, lambda: [soft.device])
+    camera.open()
+    read_back = {name: value for name, value in camera.settings_read_back().items() if name.startswith("depth")}
+    assert read_back == {
+        "depth_preset": 3.0,
+        "depth_emitter": 1.0,
+        "depth_laser_mw": 240.0,
+        "depth_exposure_us": 4000.0,
+        "depth_gain": 16.0,
+        "depth_auto_exposure": 0.0,
+    }
+    camera.close()
+    assert settings_not_kept(wanted, read_back) == ()
+    (wrong,) = settings_not_kept(wanted, {**read_back, "depth_emitter": 0.0})
+    assert "depth_emitter" in wrong
+    dark = settings(depth_emitter=False)
+    assert (
+        settings_not_kept(dark, {**read_back, "depth_emitter": 0.0, "depth_laser_mw": 0.0, "depth_preset": 1.0}) == ()
+    )
 
 
 def test_no_camera_is_said_at_once() -> None:

@@ -55,7 +55,7 @@ def frame_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number, zone in enumerate([Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN, Zone.NONE]):
         scene = Scene(zone=zone, angle_deg=10.0 * number - 20, seed=number)
         left, center, right = volumes_l(scene, height_field(scene))
-        entry = Entry(f"{number:03d}", zone, scene.angle_deg, left, center, right, {"ambiguous": "false"})
+        entry = Entry(f"{number:03d}", zone, scene.angle_deg, left, center, right, extra={"ambiguous": "false"})
         writer.add(entry, render(scene, color_size=COLOR, depth_size=DEPTH))
     return folder
 

@@ -44,6 +44,7 @@ CONDITIONS = {
     ),
     "camera": (
         "missing stale black blown_out blocked frozen blurred torn wrong_resolution knocked depth_missing "
+        "blade_elsewhere obstructed "
         "worker_restarted worker_hung settings_not_kept"
     ),
     "daemon": (

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Zone
 from graderd.hal.camera import Frame
@@ -48,7 +49,7 @@ ANGLES_DEG = (-40.0, -15.0, 10.0, 40.0)
 
 @functools.cache
 def view(angle_deg: float) -> EmptyBlade:
-    scene = Scene(angle_deg=angle_deg, seed=int(angle_deg) + 50, blade=BladeGeometry(length_m=1.02))
+    scene = Scene(angle_deg=angle_deg, seed=int(angle_deg) + 50, blade=BladeGeometry(length_m=1.015))
     return EmptyBlade(render(scene, TRUE, color_size=(640, 400), depth_size=(424, 240)), angle_deg)
 
 
@@ -71,7 +72,7 @@ def test_pose_and_blade_are_found() -> None:
     for name in POSE:
         limit = 0.15 if name.endswith("_deg") else 0.003
         assert getattr(result.calibration.color, name) == pytest.approx(POSE_HERE[name], abs=limit), name
-    assert result.blade.length_m == pytest.approx(1.02, abs=0.005)
+    assert result.blade.length_m == pytest.approx(1.015, abs=0.005)
     assert result.blade.height_m == pytest.approx(0.25, abs=0.005)
     assert result.blade.x_offset_m == pytest.approx(0.0, abs=0.004)
 
@@ -159,10 +160,35 @@ def test_picture_of_the_result() -> None:
     assert not np.array_equal(picture, frame.color_bgr)
 
 
-def test_a_pile_before_the_blade_is_not_taken_for_the_ground() -> None:
-    spoilt = Scene(zone=Zone.LEFT, angle_deg=0.0, seed=3, blade=BladeGeometry(length_m=1.02))
+def test_a_bed_that_would_not_be_found_empty_is_refused() -> None:
+    """Soil before the blade in one of the frames."""
+    spoilt = Scene(zone=Zone.LEFT, angle_deg=0.0, seed=3, blade=BladeGeometry(length_m=1.015))
     views = [view(angle) for angle in ANGLES_DEG]
     views.append(EmptyBlade(render(spoilt, TRUE, color_size=(640, 400), depth_size=(424, 240)), 0.0))
-    result = calibrate(views, NOMINAL, BladeGeometry())
-    assert result.calibration.color.position_z_m == pytest.approx(0.58, abs=0.006)
-    assert result.calibration.color.pitch_down_deg == pytest.approx(37.0, abs=0.3)
+    with pytest.raises(CalibrationError, match=r"empty bed at \+0\.0 deg would not be found empty: left"):
+        calibrate(views, NOMINAL, BladeGeometry())
+
+
+@pytest.mark.parametrize("up_mm", [10.0, 50.0])
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_raised_blade_does_not_become_a_taller_one(up_mm: float, measured: bool) -> None:
+    raised = BladeGeometry(bottom_z_m=up_mm / 1000)
+    attitude = MeasuredAttitude(up_mm, 0.0, 0.0) if measured else MeasuredAttitude()
+    views = []
+    for angle in (-40.0, 0.0, 40.0):
+        scene = Scene(angle_deg=angle, seed=int(angle) + 50, blade=raised)
+        frame = render(scene, NOMINAL, color_size=(640, 400), depth_size=(424, 240))
+        views.append(EmptyBlade(frame, angle, attitude))
+    assert calibrate(views, NOMINAL, BladeGeometry()).blade.height_m == pytest.approx(0.25, abs=0.005)
+
+
+def test_a_blade_far_off_its_drawing_is_refused() -> None:
+    """The lifts say that it stands on the ground, and it hangs 40 mm above."""
+    raised = BladeGeometry(bottom_z_m=0.04)
+    views = []
+    for angle in (-40.0, 0.0, 40.0):
+        scene = Scene(angle_deg=angle, seed=int(angle) + 50, blade=raised)
+        frame = render(scene, NOMINAL, color_size=(640, 400), depth_size=(424, 240))
+        views.append(EmptyBlade(frame, angle, MeasuredAttitude(2.0, 0.0, 0.0)))
+    with pytest.raises(CalibrationError, match=r"comes out as .* mm off the .* configured"):
+        calibrate(views, NOMINAL, BladeGeometry())

@@ -39,7 +39,7 @@ def folder(tmp_path: Path) -> Path:
         color = rng.integers(0, 255, (40, 64, 3), dtype=np.uint8)
         depth = rng.integers(0, 1700, (30, 53), dtype=np.uint16)
         entry = Entry(
-            f"{number:03d}", label, 12.5, 4.5 if label else None, 1.0, 0.0, {"ambiguous": "true", "soil": "a,b"}
+            f"{number:03d}", label, 12.5, 4.5 if label else None, 1.0, 0.0, extra={"ambiguous": "true", "soil": "a,b"}
         )
         writer.add(entry, Frame(color, depth, None, None, 0.0))
     return tmp_path / "set"

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.camera import Frame
 from graderd.perception.classifier import NEVER_S, judge_frame
@@ -24,7 +25,13 @@ class Always:
     def __init__(self) -> None:
         self.asked: list[float] = []
 
-    def classify(self, frame: Frame, blade_angle_deg: float, blade_angle_age_s: float) -> SoilObservation:
+    def classify(
+        self,
+        frame: Frame,
+        blade_angle_deg: float,
+        blade_angle_age_s: float,
+        attitude: MeasuredAttitude = UNMEASURED,
+    ) -> SoilObservation:
         self.asked.append(blade_angle_age_s)
         return SoilObservation(frame.capture_s, Zone.LEFT, 1.0, "", blade_angle_age_s=blade_angle_age_s)
 

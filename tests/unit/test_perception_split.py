@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry, meeting_point
 from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.camera import Frame
@@ -112,7 +113,7 @@ def look(zone: Zone, angle_deg: float, method: Method = "depth") -> SoilObservat
     color, depth = renderer.render(seen, Appearance())
     frame = Frame(color, depth, renderer.color_intrinsics, renderer.depth_intrinsics, 0.0)
     classifier = make_classifier(PerceptionSettings(method=method), CameraCalibration(), BLADE, live=False)
-    return classifier.classify(frame, angle_deg, 0.01)
+    return classifier.classify(frame, angle_deg, 0.01, MeasuredAttitude(2.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("method", ["paper", "fast_color"])

@@ -107,6 +107,27 @@ ROWS = (
         axes=NO_AXIS,
     ),
     FaultRow(
+        "camera.blade_elsewhere",
+        "the blade is not where its measured angle and lifts say",
+        "a slipped horn or linkage, or lifts and angle that were set up wrongly",
+        "compare blade and 'graderd status'; mend the linkage or correct [attitude] and [rotation]; "
+        "then 'graderd auto' again",
+        Reaction.RETREAT,
+        debounce_s=1.0,
+        axes=ROTATION,
+        automatic_only=True,
+    ),
+    FaultRow(
+        "camera.obstructed",
+        "something that is no soil stands before the blade",
+        "a person, a post or another tall thing in the blade's zone",
+        f"see that everybody is clear of the blade and nothing stands before it; {AGAIN}",
+        Reaction.RETREAT,
+        debounce_s=0.1,
+        axes=ROTATION,
+        automatic_only=True,
+    ),
+    FaultRow(
         "camera.depth_missing",
         "the camera gives no depth, or too little",
         "direct sun, a shiny or wet blade, or a stream that has stopped",

@@ -20,9 +20,10 @@ from typing import BinaryIO
 import cv2
 from pydantic import BaseModel, ValidationError
 
+from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.hal.camera import Camera, EndOfFrames, Frame, Intrinsics
 from graderd.hal.errors import DeviceError, DeviceTimeoutError
-from graderd.hal.settings import CameraSettings
+from graderd.hal.settings import DEPTH_PRESETS, CameraSettings
 from graderd.perception.classifier import Classifier, judge_frame, make_classifier
 from graderd.perception.frame_set import Entry, FrameSetWriter
 from graderd.perception.settings import CameraCalibration, StreamCalibration
@@ -80,6 +81,8 @@ class Worker:
         self._lines = lines
         self._out = out
         self._angles = AngleHistory()
+        self._attitude = UNMEASURED
+        """The newest: lifts and tilt move a millimetre between frames."""
         self._preview_wanted = threading.Event()
         self._to_save: queue.SimpleQueue[SaveFrame] = queue.SimpleQueue()
         self._writers: dict[str, FrameSetWriter] = {}
@@ -94,6 +97,7 @@ class Worker:
             message = ToChild.validate_json(line)
             if isinstance(message, Angle):
                 self._angles.add(message.time_s, message.angle_deg)
+                self._attitude = message.attitude
             elif isinstance(message, SaveFrame):
                 self._to_save.put(message)
             else:
@@ -142,23 +146,24 @@ class Worker:
                 self._send(CameraProblem(condition="missing", message=str(error), final=True))
                 return 3
             angle_deg, age_s = self._angles.at(frame.capture_s)
+            attitude = self._attitude
             observation = judge_frame(
-                classifier, frame, angle_deg, age_s, time.monotonic(), self._start.perception.decision
+                classifier, frame, angle_deg, age_s, time.monotonic(), self._start.perception.decision, attitude
             )
             self._send(Observed.of(observation))
             if not self._to_save.empty():
-                self._save(self._to_save.get(), frame)
+                self._save(self._to_save.get(), frame, attitude)
             if self._preview_wanted.is_set():
                 self._preview_wanted.clear()
                 self._send(Preview(jpeg_base64=_jpeg(classifier, frame, observation)))
 
-    def _save(self, wanted: SaveFrame, frame: Frame) -> None:
+    def _save(self, wanted: SaveFrame, frame: Frame, attitude: MeasuredAttitude) -> None:
         problem = ""
         try:
             if wanted.folder not in self._writers:
                 calibration = with_lens_of(frame, self._start.calibration)
                 self._writers[wanted.folder] = FrameSetWriter(Path(wanted.folder), calibration, self._start.blade)
-            self._writers[wanted.folder].add(Entry(wanted.id, None, wanted.blade_angle_deg), frame)
+            self._writers[wanted.folder].add(Entry(wanted.id, None, wanted.blade_angle_deg, attitude=attitude), frame)
         except OSError as error:
             problem = f"{wanted.folder}: {error.strerror}"
         self._send(Saved(id=wanted.id, problem=problem))
@@ -197,8 +202,14 @@ def with_lens_of(frame: Frame, calibration: CameraCalibration) -> CameraCalibrat
 def settings_not_kept(settings: CameraSettings, read_back: dict[str, float]) -> tuple[str, ...]:
     """Settings whose read-back value is more than 5 % off what was asked for."""
     wrong = []
-    for name in ("exposure_us", "gain", "white_balance_k"):
-        wanted = getattr(settings, name)
+    colour, depth = ("exposure_us", "gain", "white_balance_k"), ("depth_laser_mw", "depth_exposure_us", "depth_gain")
+    asked: dict[str, float | None] = {name: getattr(settings, name) for name in (*colour, *depth)}
+    asked["depth_emitter"] = float(settings.depth_emitter)
+    if settings.depth_preset is not None:
+        asked["depth_preset"] = float(DEPTH_PRESETS.index(settings.depth_preset))
+    if not settings.depth_emitter:
+        asked["depth_laser_mw"] = None
+    for name, wanted in asked.items():
         got = read_back.get(name)
         if wanted is not None and got is not None and abs(got - wanted) > 0.05 * wanted:
             wrong.append(f"{name}: asked {wanted:g}, device says {got:g}")

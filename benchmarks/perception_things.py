@@ -1,0 +1,82 @@
+"""Legs, foliage and pipes before the blade, on empty and loaded beds: what depth makes of them.
+
+    python -m benchmarks.perception_things                # 240 placements
+    python -m benchmarks.perception_things --each 5       # fewer
+
+Every placement is judged on an empty bed, or with a heap in another third. Bars: no thing alone is called a pile, and
+no heap on one side is answered with the other because of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+
+import cv2
+
+from graderd.core.attitude import MeasuredAttitude
+from graderd.core.blade import BladeGeometry
+from graderd.core.soil import SoilObservation, Zone
+from graderd.perception import CameraCalibration, PerceptionSettings
+from graderd.perception.classifier import Classifier, make_classifier
+from graderd.simulator.camera.renderer import Renderer
+from graderd.simulator.grader.piles import SceneZone
+from harness.perception_things import COLOR_SIZE, DEPTH_SIZE, KINDS, SIDES, photograph
+
+OPPOSITE = {Zone.LEFT: SceneZone.RIGHT, Zone.RIGHT: SceneZone.LEFT}
+
+
+def sweep(each_n: int) -> list[tuple[str, Zone, SceneZone, float, SoilObservation]]:
+    """Judge ``each_n`` placements of every thing in every third, every other one on a loaded bed."""
+    renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, seed=7)
+    judge: Classifier = make_classifier(
+        PerceptionSettings(method="depth"), CameraCalibration(), BladeGeometry(), live=False
+    )
+    found = []
+    for kind in KINDS:
+        for side in SIDES:
+            for number in range(each_n):
+                loaded = SceneZone.NONE
+                if number % 2:
+                    loaded = OPPOSITE.get(side, SceneZone.LEFT if number % 4 == 1 else SceneZone.RIGHT)
+                angle_deg = (-30.0, 0.0, 15.0, 45.0)[number // 2 % 4]
+                frame = photograph(renderer, kind, side, loaded, angle_deg, number)
+                observation = judge.classify(frame, angle_deg, 0.0, MeasuredAttitude(2.0, 0.0, 0.0))
+                found.append((kind, side, loaded, angle_deg, observation))
+    return found
+
+
+def wrong(side: Zone, loaded: SceneZone, observation: SoilObservation) -> str:
+    """What is wrong about an answer; empty where nothing is."""
+    if observation.zone is Zone.UNKNOWN:
+        return ""
+    if loaded is SceneZone.NONE:
+        return "" if observation.zone is Zone.NONE else "ghost"
+    if observation.zone is side:
+        return "swap"
+    return ""
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--each", type=int, default=27, help="placements of each thing in each third")
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    counts: Counter[tuple[str, str, str]] = Counter()
+    bad = 0
+    for kind, side, loaded, angle_deg, observation in sweep(options.each):
+        counts[kind, "loaded" if loaded is not SceneZone.NONE else "empty", str(observation.zone)] += 1
+        if problem := wrong(side, loaded, observation):
+            bad += 1
+            print(f"{problem}: {kind} {side} at {angle_deg:+.0f} deg, soil {loaded}: {observation.zone} "
+                  f"{observation.confidence * 100:.0f} %, {observation.reason}")  # fmt: skip
+    for (kind, bed, zone), count in sorted(counts.items()):
+        print(f"{kind:<8} {bed:<7} {zone:<8} {count}")
+    print(f"{sum(counts.values())} placements, {bad} wrong")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
