@@ -21,7 +21,7 @@ from harness.api_daemon import FakeDaemon, serving
 
 pytestmark = pytest.mark.live
 
-NO_LIMITS = ApiLimits(rate_hz=1e4, burst_n=10**6, stop_rate_hz=1e4, accept_rate_hz=1e4, command_timeout_s=30.0)
+NO_LIMITS = ApiLimits(rate_hz=1e4, burst_n=10**6, stop_rate_hz=1e4, accept_rate_hz=1e4, command_timeout_s=10.0)
 MANY = settings(
     max_examples=200,
     deadline=None,
