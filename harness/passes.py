@@ -34,6 +34,7 @@ from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.piles import SceneZone
 from graderd.simulator.grader.world import World, scene_heights
+from graderd.simulator.servo.motion import Profile, Trajectory
 
 DRIVE_M = 3.0
 SETTLED_DEG = 0.7
@@ -125,17 +126,25 @@ class LoopPass:
     def __init__(self, case: Case, settings: TickSettings, config: Config, materials: Materials) -> None:
         self.case = case
         self.world = World()
-        self.angle_deg, self.goal_deg = case.start_deg, case.start_deg
+        self.servo = Trajectory()
+        self.servo.restart(case.start_deg)
+        turns = settings.figures["rotation"]
+        self._profile = Profile(turns.speed, turns.acceleration)
         self.now_s = 1000.0
         self._controller = Controller(settings)
         self._classifier = make_classifier(config.perception, config.camera.calibration, config.blade)
         self._renderer = Renderer((640, 400), (424, 240), seed=case.seed, materials=materials)
         self._coming: list[tuple[float, SoilObservation]] = []
         self._number = 0
-        self._powered = False
+        self._powered = self._driven = False
         self.world.blade = BladePose(case.start_deg)
         heights = scene_heights(SceneZone(case.zone), self.world.vehicle.x_m, self.world.blade, case.seed)
         self.world.lay(heights)
+
+    @property
+    def angle_deg(self) -> float:
+        """Where the blade is."""
+        return self.servo.position_deg
 
     def ticks(self) -> Iterator[Tick]:
         """Armed and in automatic operation, for as long as somebody looks."""
@@ -148,15 +157,16 @@ class LoopPass:
             tick = self._controller.step(self._sensed(commands.get(number, ())))
             assert all(reply.accepted for reply in tick.replies), tick.replies
             self._powered = tick.intents.power
-            send = tick.axes["rotation"].send
-            self.goal_deg = self.goal_deg if send is None else send
+            decided = tick.axes["rotation"]
+            self._driven = decided.send is not None or (self._driven and not decided.hold)
+            if decided.send is not None:
+                self.servo.goal_deg = decided.send
             yield tick
 
     def _step(self) -> None:
         self.now_s += self.STEP_S
         self._number += 1
-        # The servo follows its goal within a few hundredths of a second.
-        self.angle_deg += (self.goal_deg - self.angle_deg) * min(1.0, self.STEP_S / 0.05)
+        self.servo.step(self.STEP_S, self._profile, 180.0)  # with its own speed and acceleration
         self.world.step(self.STEP_S, BladePose(self.angle_deg))
         if self._number % self.FRAME_N == 0:
             self._look()
@@ -179,7 +189,14 @@ class LoopPass:
         return Sensed(
             now_s=now_s,
             axes={
-                "rotation": AxisSensed(lifecycle, RotatorTelemetry(angle_deg=Reading(self.angle_deg, now_s))),
+                "rotation": AxisSensed(
+                    lifecycle,
+                    RotatorTelemetry(
+                        angle_deg=Reading(self.angle_deg, now_s),
+                        velocity_deg_per_s=Reading(self.servo.velocity_deg_per_s, now_s),
+                        goal_deg=self.servo.goal_deg if self._driven else None,
+                    ),
+                ),
                 **{
                     axis: AxisSensed(lifecycle, ActuatorTelemetry(position_mm=Reading(home[axis], now_s)))
                     for axis in ACTUATORS
