@@ -35,6 +35,7 @@ async def test_the_demonstration_turns_the_blade_by_what_the_camera_sees() -> No
         assert measured_deg == pytest.approx(requested_deg, abs=0.5)
 
 
+@pytest.mark.serial_only  # a worker's folders are too long for a socket's name
 async def test_two_demonstrations_beside_each_other_pass(tmp_path: Path) -> None:
     """Two checkouts, or two users: nothing of one is the other's, whatever the place for run-time files."""
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
@@ -51,6 +52,7 @@ async def test_two_demonstrations_beside_each_other_pass(tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.serial_only  # a worker's folders are too long for a socket's name
 async def test_a_demonstration_that_fails_says_why_in_its_last_event(tmp_path: Path) -> None:
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "graderd", "demo", "--json"),
@@ -71,6 +73,7 @@ async def test_a_demonstration_that_fails_says_why_in_its_last_event(tmp_path: P
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.serial_only  # a worker's folders are too long for a socket's name
 async def test_a_demonstration_ended_from_outside_says_so_and_leaves_nothing(tmp_path: Path) -> None:
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "graderd", "demo", "--json"),
