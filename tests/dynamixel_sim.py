@@ -123,7 +123,7 @@ async def bench(
     try:
         if opened:
             await rotator.open()
-        figures = Config(rotation=settings).figures()
+        figures = Config().model_copy(update={"rotation": settings}).figures()  # a slow watchdog among them
         yield Bench(rotator, servo, bus, clock, PlausibilityMonitor(motion_figures(settings, figures)))
     finally:
         await rotator.close()
