@@ -138,6 +138,12 @@ def _remove_stale(path: Path) -> None:
             return
         except BlockingIOError:
             pass  # its queue is full: somebody listens
+    if _is_locked_by_us(path):
+        raise SocketInUseError(
+            f"api socket {path}",
+            f"another daemon (process {os.getpid()}) serves it",
+            "stop that one, or give this one another socket",
+        )
     raise SocketInUseError(
         f"api socket {path}", "another program listens on it", "stop that one, or choose another path"
     )

@@ -103,7 +103,10 @@ def test_stop_and_start_by_hand(ready: Grader, rig: Rig, listener: RawBus) -> No
     assert not bus_users(CAN), "a socket is left behind"
     assert not SOCKET.parent.exists()
     listener.drain()
-    state = ready.start()
+    ready.unit.ctl("start")
+    ready.wait("stopped, as it was left", lambda status: status["mode"] == "stopped")
+    ready.client.reset()
+    state = ready.wait_ready()
     assert state["mode"] == "disarmed"
     assert daemons_claim(listener)[0] == OURS, "a start asks for the preferred address, whatever it had before"
     assert angle(rig) == pytest.approx(stood_deg, abs=0.3)
