@@ -14,9 +14,12 @@ from graderd.config import Config
 from graderd.core.status import Status
 
 UNITS = re.compile(
-    r"_(deg|deg_per_s|deg_per_s2|deg_per_mm|mm|mm_per_s|mm_per_s2|m|s|ms|us|hz|a|v|c|n|px|l|mb|k|nm|percent|ratio|share|per_s)$"
+    r"_(deg|deg_per_s|deg_per_s2|deg_per_mm|mm|mm_per_s|mm_per_s2|m|s|ms|us|hz|a|v|c|n|px|l|mb|k|nm|mw|percent|ratio|share|per_s)$"
 )
-DIMENSIONLESS = {"share_left", "share_center", "share_right", "confidence", "min_confidence", "thermal_load", "gain"}
+DIMENSIONLESS = {"share_left", "share_center", "share_right", "confidence", "min_confidence", "thermal_load"} | {
+    "gain",
+    "depth_gain",
+}
 UNIT_BESIDE = {"requested", "limited", "sent", "measured"}
 """AxisStatus: the unit stands in the field ``unit`` of the same object, because an axis is in deg or mm."""
 EXEMPT = {"Config.version", "Intrinsics"}
