@@ -162,6 +162,14 @@ def _configured_socket() -> list[Path]:
     return [Path(socket_path)] if isinstance(socket_path, str) and socket_path else []
 
 
+def _is_socket(path: Path) -> bool:
+    """A place that this user may not look into has none for him: the connection then says so."""
+    try:
+        return path.is_socket()
+    except PermissionError:
+        return False
+
+
 def user_name() -> str:
     """Who asks, for the daemon's records: the user."""
     try:
@@ -691,7 +699,7 @@ class _Address:
         if self.path is None:
             return http.client.HTTPConnection(self.host, self.port_n, timeout=timeout_s)
         stop_socket = self.path.with_suffix(STOP_SUFFIX)
-        if for_path == "/v1/stop" and stop_socket.is_socket():  # where nobody else waits; an older daemon has none
+        if for_path == "/v1/stop" and _is_socket(stop_socket):  # where nobody else waits; an older daemon has none
             return _UnixConnection(stop_socket, timeout_s)
         return _UnixConnection(self.path, timeout_s)
 

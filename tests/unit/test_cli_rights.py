@@ -5,6 +5,7 @@ Everywhere, whoever runs the tests: the rights are taken away from the user ther
 
 from __future__ import annotations
 
+import logging
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,6 +18,12 @@ from graderd.cli.app import run_app
 from graderd.config import ConfigError, load
 from graderd.config.rewrite import check_rights, rewrite
 from tests.users import bound_by_file_rights
+
+
+def wait_for_the_log() -> None:
+    """It is written by a thread, which ends with the process."""
+    for handler in logging.getLogger().handlers:
+        handler.close()
 
 
 @pytest.fixture
@@ -63,6 +70,7 @@ def test_one_line_and_the_right_status(
     machine: Path, words: list[str], status: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run_app(words) == status
+    wait_for_the_log()
     said = capsys.readouterr()
     assert said.err.count("\n") == 1
     assert "ermission denied" in said.err or "may not use" in said.err
@@ -71,6 +79,7 @@ def test_one_line_and_the_right_status(
 
 def test_the_guard_acts_all_the_same(machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_app(["guard"]) == 1  # neither wire is there
+    wait_for_the_log()
     said = capsys.readouterr().err
     assert "taking the defaults" in said
     assert '{"failed": ["lift_left, lift_right, tilt", "rotation"]}' in said
