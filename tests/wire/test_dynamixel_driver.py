@@ -81,7 +81,7 @@ async def test_a_tap_hears_every_connection_until_it_ends(tmp_path: Path) -> Non
 
 
 async def test_hold_is_the_very_next_packet(tmp_path: Path) -> None:
-    tap, rotator, wire = await tapped(tmp_path, VirtualServo(), goal_timeout_s=5.0)
+    tap, rotator, wire = await tapped(tmp_path, VirtualServo(), goal_timeout_s=1.0)
     wire.inject("delay", seconds=0.004)  # so that there is usually a request in flight
     await rotator.arm()
     for i in range(12):
@@ -98,7 +98,7 @@ async def test_hold_is_the_very_next_packet(tmp_path: Path) -> None:
 
 
 async def test_goals_are_sent_once_and_the_profile_only_after_a_hold(tmp_path: Path) -> None:
-    tap, rotator, wire = await tapped(tmp_path, VirtualServo(), goal_timeout_s=5.0)
+    tap, rotator, wire = await tapped(tmp_path, VirtualServo(), goal_timeout_s=1.0)
     await rotator.arm()
     start = len(tap.sent)
     for _ in range(10):
@@ -169,7 +169,7 @@ async def test_what_does_not_read_back_ends_the_arming_without_torque(
 
 
 async def test_a_disarm_that_could_not_be_finished_is_finished_when_the_wire_is_back(tmp_path: Path) -> None:
-    async with bench(tmp_path, reply_timeout_s=5.0) as rig:
+    async with bench(tmp_path, reply_timeout_s=1.5) as rig:
         await rig.rotator.arm()
         rig.bus.inject("drop_requests")
         with pytest.raises(DeviceTimeoutError):
