@@ -193,8 +193,8 @@ async def test_services_of_the_servo_want_consent(tmp_path: Path, capsys: Captur
         assert "Repeat with --yes" in capsys.readouterr().err
         assert await cli(path, "rotation", "reboot", "--yes", "--json") == 0
         assert json.loads(capsys.readouterr().out) == {"rebooted": True}
-        assert await cli(path, "rotation", "step", "--yes") == 1
-        assert "rotation.step_response" in capsys.readouterr().err
+        assert await cli(path, "rotation", "step") == 2
+        assert "Repeat with --yes" in capsys.readouterr().err
         assert await cli(path, "profile", "verify", "rotation") == 0
         assert "as its profile says" in capsys.readouterr().out
 
