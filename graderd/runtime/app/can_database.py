@@ -24,11 +24,11 @@ def main(argv: list[str] | None = None) -> int:
     try:
         config = load(arguments.config)
     except ConfigError as error:
-        sys.stderr.write(f"{error}\n")
+        sys.stderr.writelines(f"graderd: {problem}\n" for problem in error.problems)
         return 1
     electraks = {name: axis for name, axis in config.actuators().items() if isinstance(axis, ElectrakSettings)}
     if not electraks:
-        sys.stderr.write("can database: the configuration names no Electrak. Other drivers' messages are not known\n")
+        sys.stderr.write("graderd: can database: the configuration names no Electrak. Other drivers' messages are not known\n")
         return 1
     database = machine_database(electraks, config.can.source_address_n)
     sys.stdout.write(database.as_kcd_string() if arguments.kcd else database.as_dbc_string())
