@@ -28,7 +28,7 @@ def main(argv: list[str] | None = None) -> int:
         return 1
     electraks = {name: axis for name, axis in config.actuators().items() if isinstance(axis, ElectrakSettings)}
     if not electraks:
-        sys.stderr.write("graderd: can database: the configuration names no Electrak. Other drivers' messages are not known\n")
+        sys.stderr.write("graderd: can database: no Electrak is configured; other drivers' messages are not known\n")
         return 1
     database = machine_database(electraks, config.can.source_address_n)
     sys.stdout.write(database.as_kcd_string() if arguments.kcd else database.as_dbc_string())
