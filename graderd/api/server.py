@@ -60,9 +60,10 @@ def unix_socket(path: Path, mode: int, group: str | None) -> Iterator[socket.soc
         raise SocketError(where, f"the path is longer than {MAX_PATH_BYTES} bytes", "choose a shorter one")
     with contextlib.ExitStack() as stack:
         try:
-            if not _is_locked_by_us(path):
+            ours = _is_locked_by_us(path)
+            if not ours:
                 stack.enter_context(_lock(path))
-            _remove_stale(path)
+            _remove_stale(path, ours=ours)
             listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
             # Linux takes the rights of the new file from the socket: nobody else gets in before they are set for good.
             os.fchmod(listener.fileno(), 0o600)
@@ -121,8 +122,8 @@ def _lock(path: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _remove_stale(path: Path) -> None:
-    """Take away what a dead daemon left at ``path``, and nothing else."""
+def _remove_stale(path: Path, *, ours: bool) -> None:
+    """Take away what a dead daemon left at ``path``, and nothing else. ``ours``: this process had its lock before."""
     try:
         kind = path.lstat().st_mode
     except FileNotFoundError:
@@ -138,7 +139,7 @@ def _remove_stale(path: Path) -> None:
             return
         except BlockingIOError:
             pass  # its queue is full: somebody listens
-    if _is_locked_by_us(path):
+    if ours:
         raise SocketInUseError(
             f"api socket {path}",
             f"another daemon (process {os.getpid()}) serves it",

@@ -249,12 +249,13 @@ def test_a_pipe_that_nobody_reads_is_not_waited_for_and_what_was_lost_is_told(mo
             log.warning("line %d", number)
         assert time.monotonic() - began_s < 2.0
         closing = threading.Thread(target=handler.close)
-        text = b""
+        text, after_n = b"", 0
         while b"were lost" not in text or not text.endswith(b"\n"):
             text += reader.read(65536)
-            log.warning("after")
+            log.warning("after")  # may be lost as well while the queue is full
+            after_n += 1
         told = int(re.search(rb"(\d+) lines of this log were lost", text)[1])  # type: ignore[index]  # or it fails
-        assert many_n - LATER_MOST_N - 2 <= told <= many_n - LATER_MOST_N
+        assert many_n - LATER_MOST_N - 2 <= told <= many_n - LATER_MOST_N + after_n
         os.set_blocking(reading, False)
         closing.start()
         while closing.is_alive():
