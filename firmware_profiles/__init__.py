@@ -1,4 +1,4 @@
-"""Device facts as data: one TOML file per model (control table or CAN layout), looked up by name.
+"""Device facts as data: one TOML file per model (control table or CAN layout), looked up by name, or by path.
 
 The package holds no behaviour: drivers read what they need from the plain dictionaries returned here. A JSON schema
 beside the files (``*.schema.json``) says what a file must contain; the tests check every file against its schema.
@@ -10,13 +10,14 @@ import difflib
 import tomllib
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 __all__ = ["UnknownProfileError", "load", "names"]
 
 
 class UnknownProfileError(LookupError):
-    """No profile of that name; the message names the nearest one and all there are."""
+    """No profile of that name; the message names the nearest one and all there are. Or its file is none."""
 
 
 def names() -> tuple[str, ...]:
@@ -27,11 +28,20 @@ def names() -> tuple[str, ...]:
 def load(name: str) -> dict[str, Any]:
     """The profile ``name`` (file name without ``.toml``) as a dictionary; a fresh copy on every call.
 
+    One that ends with ``.toml`` is the path of a file elsewhere, such as ``graderd profile import`` writes.
+
     Raises:
-        UnknownProfileError: there is no such profile.
+        UnknownProfileError: there is no such profile, or its file is not readable or no TOML.
     """
-    text = _text(name)
-    return tomllib.loads(text)
+    if not name.endswith(".toml"):
+        return tomllib.loads(_text(name))
+    remedy = "Write it with 'graderd profile import'"
+    try:
+        return tomllib.loads(Path(name).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UnknownProfileError(f"firmware profile {name}: {error.strerror}. {remedy}") from None
+    except ValueError as error:
+        raise UnknownProfileError(f"firmware profile {name}: {error}. {remedy}") from None
 
 
 @cache

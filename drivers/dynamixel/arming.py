@@ -48,10 +48,10 @@ def hold_acceleration_counts(settings: Ph54Settings, calibration: Calibration) -
     return calibration.acceleration_counts(settings.profile_acceleration_deg_per_s2 * HOLD_ACCELERATION_FACTOR)
 
 
-def eeprom_counts(settings: Ph54Settings, calibration: Calibration) -> dict[str, int]:
+def eeprom_counts(calibration: Calibration) -> dict[str, int]:
     """What arming writes into the servo's EEPROM where it is not there already."""
     low, high = calibration.servo_limits()
-    current = {"current_limit": round(settings.current_limit_a * 1000.0)}
+    current = {"current_limit": round(calibration.current_limit_a * 1000.0)}
     return current if calibration.needs_turns else current | {"min_position_limit": low, "max_position_limit": high}
 
 
@@ -85,7 +85,7 @@ async def _power_up(device: Ph54Device, settings: Ph54Settings, calibration: Cal
         )
     goals, _ = await device.read_block(device.goal_block)
     limits, _ = await device.read_block(device.limit_block)
-    wanted = eeprom_counts(settings, calibration)
+    wanted = eeprom_counts(calibration)
     stale = {name: value for name, value in wanted.items() if limits[name] != value}
     tripped = goals["bus_watchdog"] == WATCHDOG_TRIPPED
     measured, raw = await _measure(device, calibration)

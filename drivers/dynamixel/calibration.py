@@ -22,7 +22,8 @@ _OVER_RATING = 1.5
 class Calibration:
     """Conversions for one servo on one blade; build it with :meth:`of`.
 
-    ``top_deg_per_s``: no output of the servo turns faster, at the highest supply voltage.
+    ``top_deg_per_s``: no output of the servo turns faster, at the highest supply voltage. ``current_limit_a``: the
+    setting, or the servo's continuous rating.
     """
 
     zero_deg: float
@@ -34,6 +35,7 @@ class Calibration:
     velocity_deg_per_s_per_count: float
     acceleration_deg_per_s2_per_count: float
     torque_nm_per_a: float
+    current_limit_a: float
     top_deg_per_s: float
 
     @classmethod
@@ -52,6 +54,7 @@ class Calibration:
             velocity_deg_per_s_per_count=per_s,
             acceleration_deg_per_s2_per_count=per_s2,
             torque_nm_per_a=rating["torque_nm_per_a"],
+            current_limit_a=settings.current_limit_a or rating["current_continuous_a"],
             top_deg_per_s=_OVER_RATING * rating["speed_no_load_rev_per_min"] * _DEG_PER_S_PER_REV_PER_MIN,
         )
 

@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, TextIO, TypedDict
 from graderd import firmware_profiles
 from graderd.drivers.dynamixel.codec import Instruction, Packet, StatusError, StreamDecoder
 from graderd.drivers.dynamixel.table import ControlTable
-from graderd.hal.errors import ProtocolError
+from graderd.hal.errors import DeviceError, ProtocolError
 
 Direction = Literal["tx", "rx"]
 _LINE: Final = re.compile(r"^\((?P<t>\d{1,12}\.\d{1,9})\) servo (?P<direction>[rt]x) (?P<data>(?:[0-9A-Fa-f]{2})+)$")
@@ -180,13 +180,6 @@ def dump(lines: Iterable[str], table: ControlTable, out: TextIO, *, as_json: boo
     return lines_n
 
 
-def _table_of(name: str) -> ControlTable:
-    profile = firmware_profiles.load(name)
-    if "table" not in profile:
-        raise ProtocolError(f"--profile {name}", "is no servo's", "Name the one of rotation.profile")
-    return ControlTable(profile)
-
-
 def main(argv: list[str] | None = None) -> int:
     """Exit status 1 where the source cannot be read."""
     parser = argparse.ArgumentParser(
@@ -199,7 +192,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="one JSON object a packet")
     arguments = parser.parse_args(argv)
     try:
-        table = _table_of(arguments.profile)
+        table = ControlTable.load(arguments.profile)
         if arguments.source == "-":
             dump(sys.stdin, table, sys.stdout, as_json=arguments.json)
             return 0
@@ -209,7 +202,7 @@ def main(argv: list[str] | None = None) -> int:
                 raise ProtocolError(arguments.source, cause, "Write one with 'graderd rotation dump --raw'")
     except (BrokenPipeError, KeyboardInterrupt):
         sys.stderr.close()  # the reader is gone, and Python would complain about it at exit
-    except (ProtocolError, firmware_profiles.UnknownProfileError, OSError) as error:
+    except (DeviceError, firmware_profiles.UnknownProfileError, OSError) as error:
         sys.stderr.write(f"{error}\n")
         return 1
     return 0

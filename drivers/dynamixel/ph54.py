@@ -1,4 +1,4 @@
-"""The blade servo: PH54-200-S500-R as a :class:`graderd.hal.rotator.Rotator`.
+"""The blade servo: PH54-200-S500-R, or another of its family by its profile, as a :class:`graderd.hal.rotator.Rotator`.
 
 One task owns the wire. Every poll period it sends what was commanded since (a hold first), reads the telemetry block
 and, less often, torque, hardware error and watchdog. It survives whatever the wire does: a lost servo makes the
@@ -47,6 +47,10 @@ class Ph54Rotator:
         settings: port, calibration, limits, timeouts.
         clock: monotonic seconds for readings and goal timeouts.
         list_ports: lists serial ports; for finding the adapter by USB serial number.
+
+    Raises:
+        CommandRangeError: the settings ask more than the servo of that profile can.
+        firmware_profiles.UnknownProfileError, WrongDeviceError: there is no such profile, or it is no servo's.
     """
 
     def __init__(
@@ -59,6 +63,7 @@ class Ph54Rotator:
         self.settings = settings
         self.table = ControlTable.load(settings.profile)
         self.calibration = Calibration.of(settings, self.table)
+        self._check_settings()
         self._mode = EXTENDED_MODE if self.calibration.needs_turns else POSITION_MODE
         self._clock: Clock = clock or SystemClock()
         self._link = ServoLink(settings, self.table, self._mode, self._clock, list_ports)
@@ -213,7 +218,7 @@ class Ph54Rotator:
         Raises:
             DeviceMissingError, DeviceTimeoutError, DeviceLostError: the servo cannot be reached.
         """
-        written = arming.eeprom_counts(self.settings, self.calibration)
+        written = arming.eeprom_counts(self.calibration)
         if self._link.is_up:  # polling goes on between the reads
             return await self._link.device.verify(self._mode, written)
         async with self._keeper.turn, self._link.visit() as device:
@@ -235,6 +240,12 @@ class Ph54Rotator:
     def confirm_turns(self) -> None:
         """The operator says that the angle shown is the blade's: whole turns are known again."""
         self._observer.confirm_turns()
+
+    def _check_settings(self) -> None:
+        most_a = (self.table["current_limit"].max or 0) / 1000.0
+        if self.calibration.current_limit_a > most_a:
+            cause = f"current_limit_a {self.calibration.current_limit_a:g} is above {most_a:g} A"
+            raise CommandRangeError(f"settings of {DEVICE}", cause, f"Profile: {self.table.name}")
 
     def _require(self, state: Lifecycle) -> None:
         if self._keeper.lifecycle is not state:

@@ -206,7 +206,7 @@ def _settings_used(rotator: Ph54Rotator) -> dict[str, str]:
         "servo": f"{rotator.table.title}, firmware {rotator.firmware_version}",
         "velocity": f"{s.profile_velocity_deg_per_s:g} °/s",
         "acceleration": f"{s.profile_acceleration_deg_per_s2:g} °/s²",
-        "current limit": f"{s.current_limit_a:g} A",
+        "current limit": f"{rotator.calibration.current_limit_a:g} A",
         "gear ratio": f"{s.gear_ratio:g}",
         "zero and sign": f"{s.zero_deg:g}°, {s.sign:+d}",
         "poll rate": f"{s.poll_hz:g} Hz at {s.baud_n} bit/s",

@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from graderd import firmware_profiles
+from graderd.hal.errors import WrongDeviceError
 
+_PARTS = ("table", "motion", "rating", "bus", "telemetry", "expected", "hardware_error")
 _CODES = {1: "B", 2: "H", 4: "I"}
 
 
@@ -131,8 +133,16 @@ class ControlTable:
 
         Raises:
             firmware_profiles.UnknownProfileError: there is no such profile.
+            WrongDeviceError: it is no servo's.
         """
-        return cls(firmware_profiles.load(name))
+        profile = firmware_profiles.load(name)
+        try:
+            if missing := [part for part in _PARTS if part not in profile]:
+                raise ValueError(f"{missing[0]} is missing")
+            return cls(profile)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            cause = f"is no control table of a servo ({error})"
+            raise WrongDeviceError(f"firmware profile {name}", cause, "Correct rotation.profile") from None
 
     def __getitem__(self, name: str) -> Register:
         return self._by_name[name]

@@ -141,7 +141,10 @@ class Ph54Settings(RotatorSettings):
     usb_serial_number: str = Field("", description="find the port by the adapter's USB serial number; empty: use port")
     baud_n: int = Field(57_600, gt=0, description="bits per second; the factory setting of the PH54 is 57,600")
     servo_id_n: int = Field(1, ge=0, le=252)
-    profile: str = Field("ph54_200_s500", description="name of the control table in firmware_profiles")
+    profile: str = Field(
+        "ph54_200_s500",
+        description="control table: its name in firmware_profiles, or path of one that 'graderd profile import' wrote",
+    )
     zero_deg: Finite = Field(
         0.0, ge=-360, le=360, description="blade angle read at the servo's zero, subtracted; within one turn"
     )
@@ -149,7 +152,9 @@ class Ph54Settings(RotatorSettings):
     gear_ratio: Positive = Field(
         1.0, ge=0.1, le=20, description="servo turns for one blade turn; beyond that its angle or its speed is none"
     )
-    current_limit_a: Positive = Field(9.3, le=22.74, description="9.3 A is the continuous rating")
+    current_limit_a: Positive | None = Field(
+        None, le=22.74, description="None: the servo's continuous rating, 9.3 A of the PH54-200"
+    )
     watchdog_s: Positive = Field(0.2, le=2.54, description="the servo's own bus watchdog, steps of 20 ms")
     poll_hz: Positive = Field(50.0, le=200, description="telemetry reads a second")
     reply_timeout_s: Positive = Field(

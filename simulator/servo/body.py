@@ -25,6 +25,16 @@ _TRIP_DECELERATION_DEG_PER_S2 = 3600.0
 """Braking after a watchdog trip: as hard as the continuous torque can (the value is not documented)."""
 
 
+def plant_of(table: ControlTable) -> PlantSettings:
+    """A blade on the servo that ``table`` is of."""
+    rating = table.profile["rating"]
+    return PlantSettings(
+        torque_nm_per_a=rating["torque_nm_per_a"],
+        no_load_current_a=rating["current_no_load_a"],
+        no_load_deg_per_s=rating["speed_no_load_rev_per_min"] * 6.0,
+    )
+
+
 class ServoBody:
     """A PH54 as seen from its shaft, and what its registers mean. Use :class:`~graderd.simulator.servo.VirtualServo`.
 
@@ -48,7 +58,7 @@ class ServoBody:
         self.table = ControlTable.load(profile)
         self.memory = ControlMemory(self.table)
         self.memory["id"] = servo_id
-        self.plant = Plant(plant or PlantSettings(torque_nm_per_a=self.table.profile["rating"]["torque_nm_per_a"]))
+        self.plant = Plant(plant or plant_of(self.table))
         self.trajectory = Trajectory()
         self.reboot_s = reboot_s
         self.powered = True
@@ -291,7 +301,8 @@ class ServoBody:
         if on and abs(plant.velocity_deg_per_s) > 0.5:
             drawn_a += math.copysign(plant.settings.no_load_current_a, plant.velocity_deg_per_s) * 0.3
         m["present_current"] = round(sign * drawn_a * 1000.0) + (self._jitter(3) if on else 0)
-        m["present_pwm"] = round(sign * 2009 * max(-1.0, min(1.0, plant.velocity_deg_per_s / 198.6))) if on else 0
+        share = max(-1.0, min(1.0, plant.velocity_deg_per_s / plant.settings.no_load_deg_per_s))
+        m["present_pwm"] = round(sign * self.table["pwm_limit"].default * share) if on else 0
         volts = plant.voltage_v if self.forced_voltage_v is None else self.forced_voltage_v
         m["present_input_voltage"] = round(volts * 10.0)
         hot = plant.temperature_c if self.forced_temperature_c is None else self.forced_temperature_c

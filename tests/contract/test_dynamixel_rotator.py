@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from graderd.drivers.dynamixel import Ph54Rotator
+from graderd.drivers.dynamixel import Ph54Rotator, model_file
+from graderd.hal.errors import CommandRangeError, WrongDeviceError
 from graderd.hal.lifecycle import Lifecycle
+from graderd.simulator.servo import VirtualServo
 from tests.contract.conformance import RotatorConformance, RotatorStand, state
 from tests.dynamixel_sim import Bench
 from tests.dynamixel_sim import bench as make_bench
@@ -105,3 +107,35 @@ class TestPh54OverFourTransports(RotatorConformance):
         await bench.until(lambda: bench.rotator.telemetry().counters.get("goal_timeouts_n", 0) > 0)
         await bench.until(lambda: abs(bench.servo.shaft_velocity_deg_per_s) < 0.5)
         assert bench.servo.shaft_deg < 45.0
+
+
+@pytest.mark.parametrize("model", ["PH42-020-S300-R", "PM54-040-S250-R"])
+class TestOthersOfTheFamilyByTheirProfile(RotatorConformance):
+    """The same driver on another servo, with nothing but the profile that ``graderd profile import`` makes."""
+
+    @pytest.fixture
+    async def stand(self, tmp_path: Path, model: str) -> AsyncIterator[Ph54Stand]:
+        assert model_file.main([model, "--to", str(tmp_path)]) == 0
+        profile = str(next(tmp_path.glob("*.toml")))
+        async with make_bench(tmp_path, VirtualServo(profile=profile), opened=False, profile=profile) as bench:
+            bench.servo.shaft_deg = 7.0
+            yield Ph54Stand(bench)
+
+    async def test_it_is_that_servo_and_its_rating_that_limits_it(self, stand: Ph54Stand, model: str) -> None:
+        await stand.device.open()
+        await stand.device.arm()
+        servo, rating = stand.bench.servo, stand.device.table.profile["rating"]
+        assert model in stand.device.table.title
+        assert servo.memory["model_number"] == stand.device.table.model_number != 2020
+        assert servo.memory["goal_current"] == rating["current_continuous_a"] * 1000
+        assert {d.kind for d in await stand.device.verify_profile()} <= {"default"}
+
+    async def test_the_profile_of_another_is_refused(self, stand: Ph54Stand) -> None:
+        settings = stand.device.settings.model_copy(update={"profile": "ph54_200_s500"})
+        with pytest.raises(WrongDeviceError, match="expected 2020"):
+            await Ph54Rotator(settings).open()
+
+    def test_more_current_than_the_servo_takes_is_refused(self, stand: Ph54Stand) -> None:
+        settings = stand.device.settings.model_copy(update={"current_limit_a": 9.3})
+        with pytest.raises(CommandRangeError, match=r"current_limit_a 9\.3 is above 4\."):
+            Ph54Rotator(settings)

@@ -115,7 +115,7 @@ def test_a_file_and_standard_input_are_read_alike(tmp_path: Path) -> None:
     [
         (["none.log"], "No such file"),
         (["letter.log"], "holds no line of the servo's wire"),
-        (["-", "--profile", "electrak_hd_b017"], "is no servo's"),
+        (["-", "--profile", "electrak_hd_b017"], "no control table of a servo"),
         (["-", "--profile", "ph54_200_s50"], "ph54_200_s500"),
     ],
 )

@@ -133,7 +133,7 @@ def _own_figures(rotation: RotatorSettings) -> dict[str, str]:
     return {
         "profile velocity": f"{rotation.profile_velocity_deg_per_s:g} deg/s",
         "profile acceleration": f"{rotation.profile_acceleration_deg_per_s2:g} deg/s²",
-        "current limit": f"{rotation.current_limit_a:g} A",
+        "current limit": f"{rotation.current_limit_a:g} A" if rotation.current_limit_a else "the servo's rating",
     }
 
 
