@@ -1,9 +1,10 @@
 """The servo wire: one owner, one request in flight, every request with a deadline. Asyncio over the port's own fd.
 
 How a late reply is kept from being taken for another one's: Protocol 2.0 has no sequence numbers. After a request
-timed out, the next thing sent is a ping, and everything that comes before the ping's reply is thrown away: replies
-keep their order, and no read of ours is as long as a ping's reply. Deadlines follow what the line was measured to
-need (as TCP does it), so that a slow adapter costs no retries and a quick one no waiting.
+timed out, a fence is sent next, and everything that comes before the fence's reply is thrown away: replies keep their
+order, and a fence's reply has a length that nothing else has which is still owed. It is a ping, and where that is owed
+itself, a read from address 0 of so many bytes. Deadlines follow what the line was measured to need (as TCP does it), so
+that a slow adapter costs no retries and a quick one no waiting; a reply that comes late says how late the line is.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import logging
 import os
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import serial
@@ -99,10 +101,20 @@ class Allowance:
         """No reply came in time: at most to twice what was learned, so that losses do not eat the time for repeats."""
         self.now_s = min(self._most_s, self.now_s * 1.5)
 
-    def late(self) -> None:
-        """A reply came after its deadline: the line is slower than what was learned."""
+    def late(self, extra_s: float) -> None:
+        """A reply to a request given up came so much later than the wire needs."""
+        if extra_s <= self.now_s:
+            return  # widened enough meanwhile
         self._most_s = _ALLOWANCE_MAX_S
-        self.widen()
+        self.now_s = min(_ALLOWANCE_MAX_S, 1.25 * extra_s)
+
+
+@dataclass(frozen=True, slots=True)
+class _Owed:
+    """The reply to a request that was given up: it may still come. ``due_s``: when it was to come, with no allowance."""
+
+    data_n: int | None
+    due_s: float
 
 
 log = logging.getLogger(__name__)
@@ -113,6 +125,10 @@ BusTap = Callable[[float, Literal["tx", "rx"], bytes], None]
 _BITS_PER_BYTE: Final = 10
 _STATUS_BYTES: Final = 11  # a status packet without data
 _PING_DATA_BYTES: Final = 3
+_FENCES: Final = (_PING_DATA_BYTES, *(n for n in range(1, 15) if n != _PING_DATA_BYTES))
+"""Lengths that a fence's reply may have: every P-series table begins with 14 bytes of registers."""
+_FORGIVEN_S: Final = 0.5
+"""What has not come by then does not come: its length may serve again."""
 
 
 @functools.lru_cache(maxsize=64)  # polling asks the same few questions for ever
@@ -174,9 +190,10 @@ class ServoBus:
         self._reply: asyncio.Future[Packet | None] | None = None
         self._room: asyncio.Future[None] | None = None
         self._everybody: list[Packet] | None = None
+        self._timer: asyncio.TimerHandle | None = None
         self._wanted_id = 0
         self._wanted_data_n: int | None = None
-        self._suspect = False
+        self._owed: deque[_Owed] = deque()
         self._counters = dict.fromkeys(
             (
                 "requests_n", "replies_n", "retries_n", "timeouts_n", "refused_n", "foreign_n", "late_n", "echo_n",
@@ -272,7 +289,7 @@ class ServoBus:
             await asyncio.sleep(_ALLOWANCE_MAX_S + MAX_ID * answer_s)
         finally:
             self._everybody = None
-            self._suspect = True
+            self._owe(_PING_DATA_BYTES)
             self._access.give_back()
         pings = [p for p in heard if len(p.data) == _PING_DATA_BYTES]
         return [(p.packet_id, p.data[0] | p.data[1] << 8, p.data[2]) for p in pings]
@@ -310,7 +327,7 @@ class ServoBus:
         await self._access.take(False)
         try:
             if servo_id != BROADCAST_ID:
-                self._suspect = True  # should it answer after all, that is not the next one's reply
+                self._owe(0)  # should it answer after all, that is not the next one's reply
             await self._transmit(encode(servo_id, instruction, params))
             await asyncio.sleep(self._byte_s * (12 + len(params)) + self._return_delay_s)
         finally:
@@ -351,9 +368,10 @@ class ServoBus:
             try:
                 if attempt:
                     self._counters["retries_n"] += 1
-                if self._suspect and urgent:
+                if self._owed and urgent:
                     await self._transmit(packet)  # a stop does not wait until the line is known to be clear
-                if self._suspect and not await self._fence(servo_id):
+                    self._owe(reply_data_n)
+                if self._owed and not await self._fence(servo_id):
                     continue
                 reply = await self._exchange(packet, servo_id, reply_data_n)
             finally:
@@ -377,14 +395,24 @@ class ServoBus:
     def _where(self, servo_id: int) -> str:
         return f"servo {servo_id} at {self.port}"
 
+    def _owe(self, data_n: int | None) -> None:
+        self._owed.append(_Owed(data_n, asyncio.get_running_loop().time()))
+
     async def _fence(self, servo_id: int) -> bool:
         """Make sure that nothing of former requests is still on its way."""
         self._counters["fences_n"] += 1
         self._decoder.reset()
-        ping = encode(servo_id, Instruction.PING)
-        if await self._exchange(ping, servo_id, _PING_DATA_BYTES) is None:
+        since_s = asyncio.get_running_loop().time() - _FORGIVEN_S
+        owed = {reply.data_n for reply in self._owed if reply.due_s > since_s}
+        data_n = next((n for n in _FENCES if n not in owed), None)
+        if data_n is None:  # fourteen questions within half a second, and no answer
+            await asyncio.sleep(self._allowance.now_s)
             return False
-        self._suspect = False
+        ping = encode(servo_id, Instruction.PING)
+        fence = ping if data_n == _PING_DATA_BYTES else _read_packet(servo_id, 0, data_n)
+        if await self._exchange(fence, servo_id, data_n) is None:
+            return False
+        self._owed.clear()
         return True
 
     async def _exchange(self, packet: bytes, servo_id: int, reply_data_n: int | None) -> Packet | None:
@@ -395,36 +423,46 @@ class ServoBus:
         self._wanted_id, self._wanted_data_n = servo_id, reply_data_n
         self._reply = reply = loop.create_future()
         self._counters["requests_n"] += 1
+        due_s = loop.time() + on_wire_s
         try:
             if not await self._transmit(packet):
                 reply.set_result(None)
-            started_s = loop.time()
+            due_s = loop.time() + on_wire_s
             heard_s = self._clock.now_s() + len(packet) * self._byte_s
-            timer = loop.call_at(started_s + on_wire_s + self._allowance.now_s, self._on_deadline, reply)
-            try:
-                answer: Packet | None = await reply
-            finally:
-                timer.cancel()
+            self._await(reply, due_s)
+            answer: Packet | None = await reply
         except BaseException:
-            self._suspect = True
+            self._owed.append(_Owed(reply_data_n, due_s))
             raise
         finally:
             self._reply = None
+            if self._timer is not None:
+                self._timer.cancel()
         if answer is None:
-            self._suspect = True
+            self._owed.append(_Owed(reply_data_n, due_s))
             self.unanswered_n += 1
             self._counters["timeouts_n"] += 1
             self._allowance.widen()
             return None
         self.heard_s = min(heard_s, self._clock.now_s())
-        self._allowance.learn(max(0.0, loop.time() - started_s - on_wire_s))
+        self._allowance.learn(max(0.0, loop.time() - due_s))
         return answer
 
-    def _on_deadline(self, reply: asyncio.Future[Packet | None]) -> None:
-        if not reply.done():
-            self._on_readable()  # a busy loop may be late for bytes that were in time
-        if not reply.done():
-            reply.set_result(None)
+    def _await(self, reply: asyncio.Future[Packet | None], due_s: float) -> None:
+        """Give the reply up at its deadline, which moves with what is learned of the line meanwhile."""
+        loop, until_s = asyncio.get_running_loop(), due_s + self._allowance.now_s
+
+        def deadline() -> None:
+            if not reply.done():
+                self._on_readable()  # a busy loop may be late for bytes that were in time
+            if reply.done():
+                return
+            if due_s + self._allowance.now_s > until_s:
+                self._await(reply, due_s)
+            else:
+                reply.set_result(None)
+
+        self._timer = loop.call_at(until_s, deadline)
 
     # -- bytes --------------------------------------------------------------------------------------------------
 
@@ -497,27 +535,33 @@ class ServoBus:
         elif self._everybody is not None:
             self._everybody.append(packet)
         elif reply is None or reply.done():
-            if packet.packet_id == self._wanted_id and not self._suspect and not self._counters["timeouts_n"]:
+            if packet.packet_id == self._wanted_id and not self._owed and not self._counters["timeouts_n"]:
                 counters["doubled_n"] += 1  # nothing was ever given up that could be late
-            self._note_late()
+            self._note_late(packet)
         elif packet.packet_id != self._wanted_id:
             counters["foreign_n"] += 1
         elif self._wanted_data_n is not None and len(packet.data) != self._wanted_data_n and not packet.error:
-            if self._suspect:
-                self._note_late()
+            if self._owed:
+                self._note_late(packet)
             else:
                 counters["invalid_n"] += 1
-        elif packet.error and self._suspect:
-            self._note_late()  # a ping is never refused: this belongs to a former request
+        elif packet.error and self._owed:
+            self._note_late(packet)  # a fence is never refused: this belongs to a former request
         else:
             counters["replies_n"] += 1
             self.last_valid_s = self._clock.now_s()
             self.unanswered_n = 0
             reply.set_result(packet)
 
-    def _note_late(self) -> None:
+    def _note_late(self, packet: Packet) -> None:
+        """Whose it was says how late the line is; what was owed before that one does not come any more."""
         self._counters["late_n"] += 1
-        self._allowance.late()
+        late = next((r for r in self._owed if r.data_n == len(packet.data)), None)
+        if late is None or packet.packet_id != self._wanted_id:
+            return
+        self._allowance.late(asyncio.get_running_loop().time() - late.due_s)
+        while len(self._owed) > 1 and self._owed[0] is not late:
+            self._owed.popleft()
 
 
 def _there_is(room: asyncio.Future[None]) -> None:

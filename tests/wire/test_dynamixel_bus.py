@@ -18,6 +18,7 @@ from graderd.drivers.dynamixel.codec import Instruction, StatusError, StreamDeco
 from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.errors import DeviceLostError, DeviceMissingError, DeviceTimeoutError
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
+from harness.awake_clock import AwakeClock
 
 TABLE = ControlTable.load("ph54_200_s500")
 GOAL = TABLE["goal_position"]
@@ -129,6 +130,36 @@ async def test_a_late_reply_is_never_taken_for_anothers(bus: ServoBus, servos: V
     packet = await bus.read(1, TABLE["profile_acceleration"].address, 4, attempts_n=10)
     assert int.from_bytes(packet.data, "little") == 222
     assert bus.counters()["late_n"] >= 1
+
+
+@pytest.mark.parametrize("delay_s", [0.04, 0.07])
+async def test_a_line_that_grows_late_gives_no_older_answer_and_is_used_again_at_once(
+    tmp_path: Path, delay_s: float
+) -> None:
+    """Also where the question whether the line is clear is itself answered late: whose answer that is must be known."""
+    clock, servo = AwakeClock(), VirtualServo()
+    wire = VirtualServoBus([servo], tmp_path / "servo", clock=clock)
+    await wire.start()
+    bus = ServoBus(str(wire.link), 57_600, clock=clock)
+    bus.open()
+    try:
+        for _ in range(4):
+            for _ in range(10):
+                await bus.read(1, 568, 2)  # the line is known to be quick
+            wire.inject("delay", seconds=delay_s)
+            lost_n, answers_n = bus.counters()["timeouts_n"], 0
+            while answers_n < 5:
+                with contextlib.suppress(DeviceTimeoutError):
+                    tick = int.from_bytes((await bus.read(1, 568, 2, attempts_n=1)).data, "little")
+                    older_s = (bus.heard_s - tick / 1000.0) % 32.768  # the servo's clock is the test's
+                    assert older_s < 0.015 or older_s > 32.7, "the answer to an older question"
+                    answers_n += 1
+            assert bus.counters()["timeouts_n"] - lost_n <= 3
+            wire.clear_faults()
+        assert bus.damaged_n == 0, "late is not damaged"
+    finally:
+        bus.close()
+        await wire.close()
 
 
 @pytest.mark.parametrize("fault", ["echo", "noise", "trickle"])
