@@ -111,7 +111,7 @@ class Allowance:
 
 @dataclass(frozen=True, slots=True)
 class _Owed:
-    """The reply to a request that was given up: it may still come. ``due_s``: when it was to come, with no allowance."""
+    """The reply to a request that was given up: it may still come. ``due_s``: when it was due, with no allowance."""
 
     data_n: int | None
     due_s: float
