@@ -19,8 +19,8 @@ import time
 from pathlib import Path
 
 from graderd.config import parse
-from graderd.hal.repeats import RepeatFilter
 from graderd.runtime.app.daemon import Daemon
+from graderd.runtime.app.journal import RepeatFilter
 
 DAY_S = 86_400.0
 ABSENT = {

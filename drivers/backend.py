@@ -13,9 +13,9 @@ from typing import Any, Generic, TypeVar
 from graderd.drivers.j1939.link import CanLink
 from graderd.hal.camera import Camera
 from graderd.hal.clock import Clock
+from graderd.hal.device import DeviceService, WatchBus
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.rotator import Rotator
-from graderd.hal.service import DeviceService, WatchBus
 from graderd.hal.settings import ActuatorSettings, CameraSettings, CanSettings, RotatorSettings, StopInputSettings
 from graderd.hal.stop_input import StopInput
 

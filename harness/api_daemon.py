@@ -28,8 +28,7 @@ from graderd.core.status import (
     SoilStatus,
     Status,
 )
-from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.service import DeviceService
+from graderd.hal.device import DeviceService, Lifecycle
 from graderd.hal.settings import Finite, Settings
 from harness.awake_clock import AwakeClock
 

@@ -13,8 +13,8 @@ from graderd.core.faults.monitor import Reaction, row_for
 from graderd.core.plausibility import PlausibilityMonitor, axis_sample, motion_figures
 from graderd.drivers.electrak import CanLink, ElectrakActuator
 from graderd.drivers.j1939.can_port import BusPort
+from graderd.hal.device import Lifecycle
 from graderd.hal.fault import DeviceFault
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 

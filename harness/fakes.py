@@ -5,9 +5,9 @@ from __future__ import annotations
 from graderd.core.attitude import MeasuredAttitude
 from graderd.core.soil import SoilObservation
 from graderd.hal.clock import ManualClock
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import CommandRangeError, DeviceError, DeviceMissingError, LifecycleError
 from graderd.hal.fault import DeviceFault
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry

@@ -19,7 +19,7 @@ from graderd.core.machine import Mode
 from graderd.core.soil import SoilObservation, Zone
 from graderd.core.tick import AxisSensed, Controller, Sensed, Tick, TickSettings
 from graderd.hal.camera import Frame
-from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.device import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry

@@ -18,7 +18,7 @@ import pytest
 from graderd.config import Config
 from graderd.core.plausibility import PlausibilityMonitor, axis_sample, motion_figures
 from graderd.drivers.dynamixel import Ph54Rotator
-from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.device import Lifecycle
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
 from harness.awake_clock import AwakeClock

@@ -10,7 +10,7 @@ from graderd.drivers.backend import Parts, RotatorBackend
 from graderd.drivers.dynamixel.dump import wire_line
 from graderd.drivers.dynamixel.ph54 import Ph54Rotator
 from graderd.drivers.dynamixel.safe_off import safe_off
-from graderd.hal.service import DeviceService, NoArguments, WatchBus
+from graderd.hal.device import DeviceService, NoArguments, WatchBus
 from graderd.hal.settings import CanSettings, Ph54Settings
 
 

@@ -20,10 +20,10 @@ from graderd.drivers.dynamixel.connection import Found, ServoLink, condition_of
 from graderd.drivers.dynamixel.device import EXTENDED_MODE, POSITION_MODE, Difference
 from graderd.drivers.dynamixel.observer import ServoObserver
 from graderd.drivers.dynamixel.serial_port import ListPorts, system_ports
-from graderd.drivers.dynamixel.servo_task import DEVICE, FIELDS, LINK_FAULTS, CommandSlot, ServoTask
-from graderd.drivers.dynamixel.states import Event
+from graderd.drivers.dynamixel.servo_task import DEVICE, FIELDS, LINK_FAULTS, CommandSlot, Event, ServoTask
 from graderd.drivers.dynamixel.table import ControlTable
 from graderd.hal.clock import Clock, SystemClock
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import (
     CommandRangeError,
     DeviceError,
@@ -31,7 +31,6 @@ from graderd.hal.errors import (
     LifecycleError,
 )
 from graderd.hal.fault import DeviceFault
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.rotator import RotatorTelemetry
 from graderd.hal.settings import Ph54Settings
 

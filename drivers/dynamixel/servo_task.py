@@ -7,6 +7,9 @@ import contextlib
 import logging
 import math
 from collections.abc import Coroutine
+from enum import StrEnum
+from types import MappingProxyType
+from typing import Final
 
 from graderd.drivers.dynamixel import arming
 from graderd.drivers.dynamixel.bus import ServoRefusedError
@@ -16,10 +19,9 @@ from graderd.drivers.dynamixel.connection import ServoLink, condition_of
 from graderd.drivers.dynamixel.device import ATTEMPTS_N, Ph54Device
 from graderd.drivers.dynamixel.motion import ServoMotion, rest_deg
 from graderd.drivers.dynamixel.observer import SUPPLY_FAULTS, ServoObserver
-from graderd.drivers.dynamixel.states import Event, after
 from graderd.hal.clock import Clock
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceError, DeviceLostError, DeviceRefusedError, DeviceTimeoutError, LifecycleError
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import Ph54Settings
 
 log = logging.getLogger(__name__)
@@ -165,6 +167,35 @@ _UNANSWERED_N = 7
 700,000; a program that stood still asked none."""
 _OLD_S = 0.15
 """A hold reads the angle again where the last reading is older; a younger one tells well enough where the blade is."""
+
+
+class Event(StrEnum):
+    """What happens to a servo. ``DISARMED``: asked for, or it is not as arming left it. ``LOST``: silent or gone."""
+
+    OPENED = "opened"
+    ARMED = "armed"
+    DISARMED = "disarmed"
+    LOST = "lost"
+    FOUND = "found"
+    CLOSED = "closed"
+
+
+_NEXT: Final = MappingProxyType(
+    {
+        (Lifecycle.CLOSED, Event.OPENED): Lifecycle.STANDBY,
+        (Lifecycle.STANDBY, Event.ARMED): Lifecycle.ACTIVE,
+        (Lifecycle.ACTIVE, Event.DISARMED): Lifecycle.STANDBY,
+        (Lifecycle.STANDBY, Event.LOST): Lifecycle.FAILED,
+        (Lifecycle.ACTIVE, Event.LOST): Lifecycle.FAILED,
+        (Lifecycle.FAILED, Event.FOUND): Lifecycle.STANDBY,
+        **{(state, Event.CLOSED): Lifecycle.CLOSED for state in Lifecycle},
+    }
+)
+
+
+def after(state: Lifecycle, event: Event) -> Lifecycle:
+    """The state that ``event`` leads to; where the table has none, nothing changes."""
+    return _NEXT.get((state, event), state)
 
 
 class ServoTask:

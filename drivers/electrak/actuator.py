@@ -22,6 +22,7 @@ from graderd.drivers.electrak.thermal import OverloadPolicy, ThermalGuard, Verdi
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id
 from graderd.drivers.j1939.link import CanLink
 from graderd.hal.clock import Clock, SystemClock
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import (
     CommandRangeError,
     DeviceError,
@@ -30,7 +31,6 @@ from graderd.hal.errors import (
     LifecycleError,
 )
 from graderd.hal.fault import DeviceFault, PresentFaults
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.settings import ElectrakSettings

@@ -8,15 +8,21 @@ plain Intel packing (decoded from a capture of a real unit).
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import cantools.database
 from cantools.database.can import Database, Message
 
-from graderd.drivers.electrak.profile import read_layout
+from graderd.drivers.electrak.profile import load_profile, read_layout
+from graderd.drivers.j1939.ids import Pgn, make_id
 from graderd.hal.errors import ProtocolError
+from graderd.hal.settings import ElectrakSettings
 
+_PRIORITY: Final = 6
+_EXTENDED: Final = 1
+"""Value of the attribute VFrameFormat: to be told by the whole identifier, not by the parameter group (3)."""
 FACTORY_FILL: Final = 0
 """The manual allows all 0 or all 1 in the unused bits of the control message; real units accepted 0."""
 
@@ -182,3 +188,33 @@ def _word(data: bytes) -> int:
     if len(data) != 8:
         raise ValueError(f"an Electrak message has 8 bytes, got {len(data)}")
     return int.from_bytes(data, "little")
+
+
+def machine_database(actuators: Mapping[str, ElectrakSettings], source: int) -> Database:
+    """One message description of the whole machine, for other CAN tools: ``ACM_<name>`` and ``AFM_<name>`` of each
+    actuator. ``source``: our own address, from which the ACM come.
+
+    The layouts in ``firmware_profiles`` describe one actuator each, at its first address, and all actuators share two
+    parameter groups: a tool that goes by the identifier knows only one of them, one that goes by the group takes all
+    for the same. Here every actuator has messages of its own, under the identifiers that it really uses.
+    """
+    messages = []
+    parts = None
+    for name, settings in actuators.items():
+        layout = load_profile(settings.profile).layout
+        parts = cantools.database.load_string(read_layout(layout), database_format="dbc")
+        assert isinstance(parts, Database)  # for the type checker: it is a DBC file
+        for message in parts.messages:
+            if message.name == "ACM":
+                message.frame_id = make_id(_PRIORITY, Pgn.PROPRIETARY_A, source, settings.address_n)
+                message.comment = f"Actuator control message to {name}, address {settings.address_n}."
+            else:
+                message.frame_id = make_id(_PRIORITY, Pgn.PROPRIETARY_A2, settings.address_n)
+                message.comment = f"Actuator feedback message of {name}, address {settings.address_n}."
+            message.name = f"{message.name}_{name}"
+            if message.dbc is not None:
+                message.dbc.attributes["VFrameFormat"].value = _EXTENDED
+            messages.append(message)
+    if parts is None:
+        return Database()
+    return Database(messages=messages, nodes=parts.nodes, dbc_specifics=parts.dbc)

@@ -18,8 +18,8 @@ from enum import StrEnum
 from typing import Final
 
 from graderd.drivers.j1939.ids import GLOBAL, MAX_ADDRESS, NULL, Frame, Pgn, make_id
-from graderd.drivers.j1939.limiter import Limiter
 from graderd.drivers.j1939.name import Name
+from graderd.hal.clock import Pace
 
 VETO_S: Final = 0.25
 """Wait after a claim before other traffic (J1939-81, addresses 128 to 247)."""
@@ -60,8 +60,8 @@ class AddressClaimer:
         self._preferred = preferred
         self._obey = obey_commanded
         self._random = random.Random(seed)
-        self._limiter = Limiter(_CLAIM_RATE_HZ, _CLAIM_BURST_N)
-        self._equal_name_limiter = Limiter(_EQUAL_NAME_RATE_HZ, _EQUAL_NAME_BURST_N)
+        self._limiter = Pace(_CLAIM_RATE_HZ, _CLAIM_BURST_N)
+        self._equal_name_limiter = Pace(_EQUAL_NAME_RATE_HZ, _EQUAL_NAME_BURST_N)
         self._veto_until_s = 0.0
         self._owed: int | None = None
         self._due_s: float | None = None
@@ -132,7 +132,7 @@ class AddressClaimer:
         del self._foreign_times_s[: -2 * _STORM_N]
         if name == self.name.value:
             self._equal_name_at_s = now_s
-            return self._owe(self.wanted, now_s) if self._equal_name_limiter.allow(now_s) else []
+            return self._owe(self.wanted, now_s) if self._equal_name_limiter.take(now_s) else []
         if self.name.value < name:
             return self._owe(self.wanted, now_s)
         self._foreign[source] = name
@@ -191,7 +191,7 @@ class AddressClaimer:
         return self._pay(now_s)
 
     def _pay(self, now_s: float) -> list[Frame]:
-        if self._owed is None or not self._limiter.allow(now_s):
+        if self._owed is None or not self._limiter.take(now_s):
             return []
         source, self._owed = self._owed, None
         self.sent_n += 1

@@ -11,6 +11,7 @@ to end it at once, from the address that was ours last, and told again until it 
 from __future__ import annotations
 
 import asyncio
+import collections
 import contextlib
 import logging
 import math
@@ -24,7 +25,6 @@ from graderd.drivers.j1939.can_port import READY_S, BusPort, PortFullError, Port
 from graderd.drivers.j1939.ids import GLOBAL, Frame, Pgn, destination_of, pgn_of, source_of
 from graderd.drivers.j1939.name import Name
 from graderd.drivers.j1939.node import Identity, J1939Node
-from graderd.drivers.j1939.self_reception import SelfReception
 from graderd.drivers.j1939.stop_message import StopWatcher
 from graderd.drivers.j1939.ticker import Ticker
 from graderd.drivers.j1939.transport import Message
@@ -105,6 +105,36 @@ class _Taps:
     frames: list[Callable[[Frame, float], None]] = field(default_factory=list)
     events: list[Callable[[BusEvent, float], None]] = field(default_factory=list)
     messages: list[Callable[[Message, float], None]] = field(default_factory=list)
+
+
+_BACK_WITHIN_S: Final = 0.25
+_PROOF_N: Final = 64
+"""Frames that must come back in a row, about two seconds of traffic, before one that did not is forgotten."""
+_WAITING_MAX_N: Final = 512
+
+
+class SelfReception:
+    """Tells an echo from another node's frame. One object for each opening of the bus."""
+
+    def __init__(self) -> None:
+        self._waiting: collections.deque[tuple[Frame, float]] = collections.deque(maxlen=_WAITING_MAX_N)
+        self._returned_n = 0
+        self._needed_n = 1
+
+    def on_sent(self, frame: Frame, now_s: float) -> None:
+        """A frame left."""
+        self._waiting.append((frame, now_s))
+
+    def is_echo(self, frame: Frame, now_s: float) -> bool:
+        """Whether a frame that came is one of ours, come back."""
+        while self._waiting and now_s - self._waiting[0][1] > _BACK_WITHIN_S:
+            self._waiting.popleft()
+            self._returned_n, self._needed_n = 0, _PROOF_N
+        if not self._waiting or self._waiting[0][0] != frame:
+            return False
+        self._waiting.popleft()
+        self._returned_n += 1
+        return self._returned_n >= self._needed_n
 
 
 class CanLink:

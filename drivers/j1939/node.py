@@ -9,9 +9,9 @@ from typing import Final
 from graderd.drivers.j1939 import dm1
 from graderd.drivers.j1939.claim import AddressClaimer, ClaimState
 from graderd.drivers.j1939.ids import GLOBAL, NULL, Frame, Pgn, destination_of, make_id, pgn_of, source_of
-from graderd.drivers.j1939.limiter import Limiter
 from graderd.drivers.j1939.name import Name
 from graderd.drivers.j1939.transport import Message, Transport
+from graderd.hal.clock import Pace
 
 DM1_PERIOD_S: Final = 1.0
 _ANSWER_RATE_HZ: Final = 20.0
@@ -69,7 +69,7 @@ class J1939Node:
         self.claim_requested_at_s = -1e9
         """When anybody last asked for claims; a claim soon after is an answer and no restart."""
         self.nacks_sent_n = 0
-        self._answers = Limiter(_ANSWER_RATE_HZ, _ANSWER_BURST_N)
+        self._answers = Pace(_ANSWER_RATE_HZ, _ANSWER_BURST_N)
         self._dm1_data = dm1.encode([])
         self._dm1_enabled = False
         self._dm1_due_s = 0.0
@@ -159,7 +159,7 @@ class J1939Node:
             if to_us or destination == GLOBAL:
                 self.outbox += self.claimer.on_request(now_s)
             return
-        if self.address is None or not (to_us or destination == GLOBAL) or not self._answers.allow(now_s):
+        if self.address is None or not (to_us or destination == GLOBAL) or not self._answers.take(now_s):
             return
         content = self._content_of(pgn)
         if content is None:

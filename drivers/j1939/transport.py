@@ -12,7 +12,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 from graderd.drivers.j1939.ids import GLOBAL, Frame, Pgn, make_id
-from graderd.drivers.j1939.limiter import Limiter
+from graderd.hal.clock import Pace
 
 MAX_SIZE: Final = 1785
 BAM_GAP_S: Final = 0.05
@@ -103,8 +103,8 @@ class Transport:
         self.aborted_n = 0
         self._incoming: dict[tuple[int, int], _Incoming] = {}
         self._outgoing: dict[int, _Outgoing] = {}
-        self._data = Limiter(DATA_RATE_HZ, DATA_BURST_N)
-        self._opens = Limiter(_OPEN_RATE_HZ, _OPEN_BURST_N)
+        self._data = Pace(DATA_RATE_HZ, DATA_BURST_N)
+        self._opens = Pace(_OPEN_RATE_HZ, _OPEN_BURST_N)
 
     # -- receiving --------------------------------------------------------------------------------------------------
 
@@ -162,7 +162,7 @@ class Transport:
         broadcast = data[0] == Control.BAM
         if broadcast != (destination == GLOBAL) or (not broadcast and destination != self.address):
             return []
-        if not broadcast and not self._opens.allow(now_s):
+        if not broadcast and not self._opens.take(now_s):
             return []
         key = (source, destination)
         if not 9 <= size <= MAX_SIZE or packets_n != math.ceil(size / 7):
@@ -254,7 +254,7 @@ class Transport:
     def _packets(self, session: _Outgoing, now_s: float) -> list[Frame]:
         """What a connection may send now of the packets it was asked for."""
         frames: list[Frame] = []
-        while session.next_n <= session.window_end_n and self._data.allow(now_s):
+        while session.next_n <= session.window_end_n and self._data.take(now_s):
             if session.sent_n >= _ASKED_FOR_MAX_N * session.packets_n:
                 del self._outgoing[session.destination]
                 self.aborted_n += 1

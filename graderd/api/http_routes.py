@@ -17,7 +17,7 @@ from graderd.api.settings import ApiLimits
 from graderd.api.stop import StopLane
 from graderd.core.commands import AnyCommand, Command, Reply, Stop
 from graderd.core.status import Status
-from graderd.hal.service import DeviceService
+from graderd.hal.device import DeviceService
 from graderd.hal.text import printable
 
 COMMAND_EXAMPLES: dict[str, Any] = {

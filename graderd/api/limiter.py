@@ -16,10 +16,10 @@ from typing import Any
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
-from graderd.api.pace import Pace
 from graderd.api.problem import Problem, answer
 from graderd.api.settings import ApiLimits
 from graderd.api.stop import STOP_PATH, is_stop_command, is_stop_path
+from graderd.hal.clock import Pace
 
 
 class Closing:

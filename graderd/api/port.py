@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from graderd.core.commands import Command, Reply, Stop
 from graderd.core.status import Status
-from graderd.hal.service import DeviceService
+from graderd.hal.device import DeviceService
 
 
 class ServiceError(Exception):

@@ -25,11 +25,11 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from graderd.api.http_head import JudgedConnection, problem_of_head
-from graderd.api.pace import Pace
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.api.stop import StopLane, is_stop_line
 from graderd.api.stop_socket import serving_stops, stop_socket_beside
 from graderd.api.tcp_guard import TcpGuard, load_or_make_token
+from graderd.hal.clock import Pace
 from graderd.hal.errors import DeviceError
 
 MAX_PATH_BYTES = 107

@@ -13,11 +13,11 @@ from typing import Any
 
 from starlette.types import Receive
 
-from graderd.api.pace import Pace
 from graderd.api.port import DaemonPort
 from graderd.api.settings import ApiLimits
 from graderd.core.commands import Reply, Stop
 from graderd.core.machine import Mode
+from graderd.hal.clock import Pace
 from graderd.hal.text import printable
 
 STOP_PATH = "/v1/stop"

@@ -7,8 +7,7 @@ from typing import Any
 
 import typer
 
-from graderd.cli.console import TAKES_ANYTHING, client_of, example, hand_over
-from graderd.cli.wire import decode_through
+from graderd.cli.console import TAKES_ANYTHING, client_of, decode_through, example, hand_over
 from graderd.client import Client, NoDaemonError
 
 _MODULE = "graderd.drivers.electrak.dump"

@@ -1,9 +1,11 @@
-"""How commands speak: text for people, one JSON object for programs, one line on stderr where something failed."""
+"""How commands speak: text for people, one JSON object for programs, one line on stderr where something failed; and
+how one gives way to a program of its own."""
 
 from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 from collections.abc import Sequence
 from enum import IntEnum
@@ -18,7 +20,6 @@ from graderd.hal.text import printable, terminal_safe_json
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
-
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 Row = Sequence[str]
@@ -144,3 +145,25 @@ def hand_over(module: str, arguments: list[str]) -> None:
         arguments = arguments[1:]
     sys.stdout.flush()
     os.execv(sys.executable, [sys.executable, "-P", "-m", module, *arguments])
+
+
+def decode_through(client: Client, bus: str, module: str, options: list[str]) -> None:
+    """Pipe what the daemon hears and sends on ``bus`` to ``module`` as standard input, until the daemon, the decoder's
+    reader or the user ends it."""
+    command = [sys.executable, "-P", "-m", module, "-", *options]
+    with (
+        client.bus_text(bus) as texts,
+        subprocess.Popen(command, stdin=subprocess.PIPE, bufsize=0) as decoder,
+    ):
+        assert decoder.stdin is not None
+        try:
+            for text in texts:
+                if decoder.poll() is not None:
+                    return
+                if text.startswith("#"):
+                    typer.echo(printable(text.partition("\n")[0]), err=True)
+                decoder.stdin.write(text.encode())
+        except (BrokenPipeError, KeyboardInterrupt):
+            return  # nobody reads on: that is how a live view ends
+        finally:
+            decoder.terminate()

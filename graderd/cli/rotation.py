@@ -13,6 +13,7 @@ from graderd.cli.console import (
     ExitCode,
     Json,
     client_of,
+    decode_through,
     example,
     for_people,
     hand_over,
@@ -20,7 +21,6 @@ from graderd.cli.console import (
     print_table,
     print_text,
 )
-from graderd.cli.wire import decode_through
 from graderd.client import Client
 
 SERVICE_S = 120.0

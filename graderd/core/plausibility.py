@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pydantic import Field
 
 from graderd.core.axes import ACTUATORS, UNITS, AxisFigures
+from graderd.hal.device import Lifecycle
 from graderd.hal.fault import DeviceFault, PresentFaults
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.rotator import RotatorTelemetry
 from graderd.hal.settings import NotNegative, Positive, RotatorSettings, Settings

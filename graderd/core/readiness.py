@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from graderd.core.axes import UNITS, AxisFigures
 from graderd.core.faults.monitor import ActiveFault, Clear, Reaction
 from graderd.core.machine import Mode, State, Unmet
-from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.device import Lifecycle
 
 
 @dataclass(frozen=True, slots=True)

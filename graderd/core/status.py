@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict
 
 from graderd.core.machine import Mode
 from graderd.core.soil import Zone
-from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.device import Lifecycle
 
 
 class _Status(BaseModel):

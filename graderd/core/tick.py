@@ -24,8 +24,8 @@ from graderd.core.plausibility import AxisSample, MotionFigures, PlausibilityMon
 from graderd.core.readiness import AxisReadiness, Requirement, requirements
 from graderd.core.rule import RuleSettings, Travel
 from graderd.core.soil import SoilObservation
+from graderd.hal.device import Lifecycle
 from graderd.hal.fault import DeviceFault, PresentFaults
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from graderd.hal.device import Lifecycle
 from graderd.hal.fault import DeviceFault
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.reading import Reading
 
 

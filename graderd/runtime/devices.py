@@ -11,12 +11,11 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from graderd.hal.device import DeviceService, Lifecycle, WatchBus
 from graderd.hal.errors import DeviceError
 from graderd.hal.fault import DeviceFault
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.rotator import Rotator
-from graderd.hal.service import DeviceService, WatchBus
 from graderd.hal.vehicle import Vehicle
 
 RETRY_S = 1.0

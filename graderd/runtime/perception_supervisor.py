@@ -22,9 +22,9 @@ from graderd.core.blade import BladeGeometry
 from graderd.core.soil import SoilObservation
 from graderd.core.status import CameraStatus
 from graderd.hal.clock import Clock
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError
 from graderd.hal.fault import DeviceFault, PresentFaults
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
 from graderd.runtime.perception_protocol import (

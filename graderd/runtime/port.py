@@ -14,8 +14,8 @@ from graderd.config import Config
 from graderd.core.commands import Command, Reply, Stop
 from graderd.core.machine import Mode
 from graderd.core.status import Status
+from graderd.hal.device import DeviceService, WatchBus
 from graderd.hal.errors import DeviceError
-from graderd.hal.service import DeviceService, WatchBus
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
 from graderd.runtime.perception_supervisor import PerceptionSupervisor

@@ -14,8 +14,8 @@ from graderd.drivers.j1939.python_can import can
 from graderd.hal.clock import Clock, SystemClock
 from graderd.hal.errors import DeviceMissingError
 from graderd.simulator.actuators import faults
+from graderd.simulator.actuators.faults import LOWEST_PRIORITY_NAME, Flood, RivalController
 from graderd.simulator.actuators.model import VirtualElectrak
-from graderd.simulator.actuators.peers import LOWEST_PRIORITY_NAME, Flood, RivalController
 from graderd.simulator.actuators.slcan import SlcanAdapter
 from graderd.simulator.actuators.wire import Listener, Wire, WireBus
 

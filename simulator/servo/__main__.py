@@ -17,10 +17,9 @@ import sys
 from pathlib import Path
 from typing import Any, TextIO
 
-from graderd.simulator.servo.bus import VirtualServoBus
+from graderd.simulator.servo.bus import VirtualServoBus, realtime_timers
 from graderd.simulator.servo.faults import FAULTS, parse
 from graderd.simulator.servo.servo import VirtualServo
-from graderd.simulator.servo.timing import realtime_timers
 
 _HELP = "status | load torque_nm=N | clear | replug | a fault with its parameters, for example: drop rate=0.2"
 

@@ -25,6 +25,7 @@ from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import catalogue_key
 from graderd.hal.camera import Camera, EndOfFrames, Frame
 from graderd.hal.clock import Clock
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import (
     CommandRangeError,
     DeviceError,
@@ -35,7 +36,6 @@ from graderd.hal.errors import (
     StaleReadingError,
 )
 from graderd.hal.fault import DeviceFault
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import Rotator

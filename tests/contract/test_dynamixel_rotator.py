@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from graderd.drivers.dynamixel import Ph54Rotator, model_file
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import CommandRangeError, WrongDeviceError
-from graderd.hal.lifecycle import Lifecycle
 from graderd.simulator.servo import VirtualServo
 from tests.contract.conformance import RotatorConformance, RotatorStand, state
 from tests.dynamixel_sim import Bench

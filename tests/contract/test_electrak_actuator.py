@@ -15,6 +15,7 @@ import pytest
 from graderd.drivers.electrak import CanLink, ElectrakActuator
 from graderd.drivers.j1939.can_port import BusPort
 from graderd.drivers.j1939.python_can import can
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import (
     CommandRangeError,
     DeviceMissingError,
@@ -23,7 +24,6 @@ from graderd.hal.errors import (
     LifecycleError,
     StaleReadingError,
 )
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import LinearActuator
 from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak

@@ -30,6 +30,7 @@ from graderd.drivers.j1939.can_port import BusPort, PortLostError, open_port
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of
 from graderd.drivers.j1939.link import CanLink, name_from
 from graderd.hal.clock import Clock
+from graderd.hal.device import DeviceService, Lifecycle, NoArguments
 from graderd.hal.errors import (
     CommandRangeError,
     DeviceLostError,
@@ -38,10 +39,8 @@ from graderd.hal.errors import (
     LifecycleError,
 )
 from graderd.hal.fault import DeviceFault
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import Rotator, RotatorTelemetry
-from graderd.hal.service import DeviceService, NoArguments
 from graderd.hal.settings import CanSettings, Positive, RotatorSettings, Settings
 from graderd.runtime.app.backends import check_plugins, rotator_of
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak

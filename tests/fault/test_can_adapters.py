@@ -20,7 +20,7 @@ from graderd.drivers.j1939.can_port import PortLostError, SlcanPort, SocketCanPo
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of
 from graderd.drivers.j1939.python_can import can
 from graderd.drivers.j1939.slcan_bus import QuietSlcanBus
-from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.device import Lifecycle
 from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from graderd.simulator.actuators.slcan import SlcanAdapter

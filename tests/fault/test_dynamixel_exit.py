@@ -15,8 +15,8 @@ import pytest
 
 from graderd.drivers.dynamixel import safe_off
 from graderd.drivers.dynamixel.arming import watchdog_counts
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceMissingError, DeviceTimeoutError
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
 from harness.awake_clock import AwakeClock

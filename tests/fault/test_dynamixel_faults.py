@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceError, DeviceRefusedError
-from graderd.hal.lifecycle import Lifecycle
 from graderd.simulator.servo import FAULTS, VirtualServo
 from tests.dynamixel_sim import Bench, armed_at, bench, standing, works_again
 

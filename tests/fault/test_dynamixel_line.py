@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from graderd.drivers.dynamixel.bus import ServoBus
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceTimeoutError, LifecycleError, WrongDeviceError
-from graderd.hal.lifecycle import Lifecycle
 from tests.contract.conformance import all_known, state
 from tests.dynamixel_sim import Bench, bench
 

@@ -11,6 +11,7 @@ import pytest
 from graderd.drivers.dynamixel import Ph54Rotator, servo_task
 from graderd.drivers.dynamixel.connection import ServoLink
 from graderd.drivers.dynamixel.servo_task import ServoTask
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import (
     DeviceError,
     DeviceMissingError,
@@ -19,7 +20,6 @@ from graderd.hal.errors import (
     LifecycleError,
     WrongDeviceError,
 )
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
 from tests.dynamixel_sim import Bench, bench, standing, until, works_again

@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 
 from graderd.drivers.dynamixel import bus as servo_bus
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceRefusedError
-from graderd.hal.lifecycle import Lifecycle
 from graderd.simulator.servo import VirtualServo
 from tests.dynamixel_sim import Bench, bench, standing
 

@@ -12,8 +12,8 @@ import pytest
 from graderd.drivers.electrak import ElectrakActuator
 from graderd.drivers.electrak.profile import load_profile
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import CanSettings
 from graderd.simulator.actuators import VirtualElectrak
 from harness.electrak_sim import Machine, SimulatedLoop, run_simulated

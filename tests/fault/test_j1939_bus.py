@@ -9,7 +9,7 @@ import itertools
 import pytest
 
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of, source_of
-from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.device import Lifecycle
 from graderd.hal.settings import CanSettings
 from harness.electrak_sim import Machine, SimulatedLoop, conditions, run_simulated, state
 

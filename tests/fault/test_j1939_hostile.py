@@ -17,8 +17,8 @@ from graderd.drivers.electrak import ElectrakActuator
 from graderd.drivers.electrak.codec import ElectrakCodec
 from graderd.drivers.j1939.can_port import BusPort, PortFullError
 from graderd.drivers.j1939.ids import GLOBAL, NULL, Frame, Pgn, destination_of, make_id, pgn_of, source_of
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceError
-from graderd.hal.lifecycle import Lifecycle
 from harness.electrak_sim import Machine, SimulatedLoop, run_simulated, state
 
 OURS = 231

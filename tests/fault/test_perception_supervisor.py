@@ -13,7 +13,7 @@ import pytest
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Zone
 from graderd.hal.clock import SystemClock
-from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.device import Lifecycle
 from graderd.hal.settings import CameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
 from graderd.runtime.perception_supervisor import PerceptionSupervisor

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from graderd.api.pace import Pace
 from graderd.api.settings import ApiLimits
 from graderd.api.stop_socket import stop_socket_beside
 from graderd.core.machine import Mode
+from graderd.hal.clock import Pace
 from harness.api_daemon import TICK_S, serving, within
 from tests.unit.test_cli_modes import command_line
 

@@ -14,7 +14,7 @@ from graderd.drivers.backend import CameraBackend, LinearActuatorBackend, Rotato
 from graderd.drivers.realsense import FolderCamera
 from graderd.drivers.simulated.stop_input import SimulatedStopInput
 from graderd.hal.clock import ManualClock
-from graderd.hal.service import DeviceService
+from graderd.hal.device import DeviceService
 from graderd.hal.settings import (
     ActuatorSettings,
     CameraSettings,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from graderd.hal.errors import CommandRangeError
-from graderd.runtime.app.calibration_frames import CalibrationFrames
+from graderd.runtime.app.services import CalibrationFrames
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_no_other_file_is_given(state: Path, name: str) -> None:
 
 @pytest.mark.live
 def test_it_goes_with_the_daemon(state: Path) -> None:
-    code = "from graderd.runtime.app.calibration_frames import CalibrationFrames as F; print(F().begin().is_dir())"
+    code = "from graderd.runtime.app.services import CalibrationFrames as F; print(F().begin().is_dir())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"
     assert list(state.iterdir()) == []

@@ -149,7 +149,7 @@ async def test_watch_on_a_terminal_redraws_until_ctrl_c(tmp_path: Path) -> None:
 
 
 def command_line(path: Path, *arguments: str) -> list[str]:
-    return [sys.executable, "-m", "graderd.cli", "--socket", str(path), *arguments]
+    return [sys.executable, "-m", "graderd", "--socket", str(path), *arguments]
 
 
 @pytest.mark.parametrize("command", ["status", "arm", "stop", "auto", "preset"])

@@ -202,7 +202,7 @@ async def test_services_of_the_servo_want_consent(tmp_path: Path, capsys: Captur
 @pytest.mark.live
 def test_the_module_and_the_command_are_the_same(tmp_path: Path) -> None:
     run = subprocess.run(
-        [sys.executable, "-m", "graderd.cli", "--socket", str(tmp_path / "none"), "stop", "--json"],
+        [sys.executable, "-m", "graderd", "--socket", str(tmp_path / "none"), "stop", "--json"],
         capture_output=True,
         text=True,
         timeout=60,

@@ -29,8 +29,8 @@ from graderd.core.faults.monitor import Clear, Reaction
 from graderd.core.machine import Mode
 from graderd.core.soil import SoilObservation, Zone
 from graderd.core.tick import AxisSensed, Controller, Sensed, Tick
+from graderd.hal.device import Lifecycle
 from graderd.hal.fault import DeviceFault
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry

@@ -23,8 +23,8 @@ from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import Reaction
 from graderd.core.soil import SoilObservation, Zone
 from graderd.core.tick import AxisSensed, AxisTick, Controller, Sensed, Tick
+from graderd.hal.device import Lifecycle
 from graderd.hal.fault import DeviceFault
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graderd.drivers.dynamixel.motion import ServoMotion, possible, rest_deg
-from graderd.drivers.dynamixel.states import Event, after
-from graderd.hal.lifecycle import Lifecycle
+from graderd.drivers.dynamixel.servo_task import Event, after
+from graderd.hal.device import Lifecycle
 
 
 @pytest.mark.parametrize(("state", "event"), list(product(Lifecycle, Event)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from graderd.drivers.j1939.ids import Frame
-from graderd.drivers.j1939.self_reception import SelfReception
+from graderd.drivers.j1939.link import SelfReception
 
 FRAMES = [Frame(0x18EF13E7, bytes((n, *[0] * 7))) for n in range(200)]
 

@@ -10,9 +10,9 @@ from graderd.core.blade import BladeGeometry, meeting_point
 from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.camera import Frame
 from graderd.perception.classifier import make_classifier
+from graderd.perception.depth import Cells, split_soil
 from graderd.perception.geometry import CENTER, LEFT, RIGHT
 from graderd.perception.settings import CameraCalibration, Method, PerceptionSettings
-from graderd.perception.split import Cells, split_soil
 from graderd.simulator.camera.appearance import Appearance
 from graderd.simulator.camera.ground import SceneState
 from graderd.simulator.camera.renderer import Renderer

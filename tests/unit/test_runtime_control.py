@@ -15,9 +15,9 @@ from graderd.config import Config
 from graderd.core import commands as cmd
 from graderd.core.machine import Mode
 from graderd.core.soil import SoilObservation, Zone
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceRefusedError
 from graderd.hal.fault import DeviceFault
-from graderd.hal.lifecycle import Lifecycle
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.control import log as control_log
 from graderd.runtime.state_file import StateFile

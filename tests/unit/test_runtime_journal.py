@@ -20,8 +20,8 @@ import pytest
 
 from graderd.hal.clock import SystemClock
 from graderd.runtime.app import journal
-from graderd.runtime.app.hang_watch import ARM_EVERY_S, HANGS_S, HangWatch
 from graderd.runtime.app.journal import LATER_MOST_N, JournalHandler, journal_entry, set_up_logging
+from graderd.runtime.health import ARM_EVERY_S, HANGS_S, HangWatch
 
 FORGED = "person\nPRIORITY=0\n<0>2026-01-01 ERROR forged\x1b[2J"
 
@@ -165,9 +165,9 @@ def test_the_unit_waits_longer_than_the_watch() -> None:
 
 HANGING = """
 import time
-from graderd.runtime.app import hang_watch
-hang_watch.HANGS_S = 0.3
-watch = hang_watch.HangWatch()
+from graderd.runtime import health
+health.HANGS_S = 0.3
+watch = health.HangWatch()
 watch.ticked(0.0)
 def somewhere_deep():
     {hang}

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, suppress
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +15,33 @@ from graderd.api.port import ServiceError
 from graderd.config import Config
 from graderd.core import commands as cmd
 from graderd.core.machine import Mode
+from graderd.hal.device import DeviceService, Lifecycle, NoArguments
 from graderd.hal.errors import DeviceLostError, DeviceRefusedError
-from graderd.hal.lifecycle import Lifecycle
-from graderd.hal.service import DeviceService, NoArguments
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.maneuver import Maneuver
 from graderd.runtime.port import Port
 from graderd.runtime.state_file import StateFile
-from harness.awake_clock import AwakeClock
+from graderd.runtime.step_response import SHARES, analyse, step_samples
+from harness.electrak_sim import SimulatedLoop, run_simulated
 from harness.fakes import FakeMachine
+
+
+def in_simulated_time(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
+    """Run a test to its end without waiting."""
+
+    @wraps(test)
+    def run(**fixtures: Any) -> None:
+        run_simulated(lambda _: test(**fixtures))
+
+    return run
 
 
 @asynccontextmanager
 async def running(tmp_path: Path) -> AsyncIterator[tuple[FakeMachine, ControlLoop]]:
-    """A control loop ticking in real time over fake devices."""
+    """A control loop ticking over fake devices, in the time of the event loop it runs on."""
     machine = FakeMachine()
-    clock = AwakeClock()
+    clock = asyncio.get_running_loop()
+    assert isinstance(clock, SimulatedLoop)
     for device in (machine.rotation, machine.lift_left, machine.lift_right, machine.tilt):
         device.clock = clock  # type: ignore[assignment]  # the fakes only read it
     loop = ControlLoop(Config(), machine.devices, machine.eyes, clock, StateFile(str(tmp_path)))
@@ -48,6 +60,7 @@ async def turn(loop: ControlLoop, angle_deg: float) -> None:
         await blade.rotate_to(angle_deg, 30.0)
 
 
+@in_simulated_time
 async def test_it_arms_turns_and_disarms(tmp_path: Path) -> None:
     async with running(tmp_path) as (machine, loop):
         seen: list[float] = []
@@ -59,6 +72,18 @@ async def test_it_arms_turns_and_disarms(tmp_path: Path) -> None:
         assert loop.tick.state.mode is Mode.DISARMED
 
 
+@in_simulated_time
+async def test_a_step_response_goes_half_way_from_both_sides_and_comes_back(tmp_path: Path) -> None:
+    async with running(tmp_path) as (machine, loop):
+        recording = analyse(await step_samples(loop, machine.rotation, 6.0, 1.0), 0.5, {})
+        assert [step.to_deg for step in recording.steps] == pytest.approx([6.0 * share for share in SHARES[1:]])
+        assert all(step.settling_s is not None and abs(step.error_deg) < 0.2 for step in recording.steps)
+        assert recording.backlash_from == "encoder"
+        assert machine.rotation.position == pytest.approx(0.0, abs=0.1)
+        assert loop.tick.state.mode is Mode.DISARMED
+
+
+@in_simulated_time
 async def test_stop_ends_it_under_way(tmp_path: Path) -> None:
     async with running(tmp_path) as (machine, loop):
 
@@ -72,6 +97,7 @@ async def test_stop_ends_it_under_way(tmp_path: Path) -> None:
         assert loop.tick.state.mode is Mode.STOPPED
 
 
+@in_simulated_time
 async def test_it_refuses_what_an_operator_would_be_refused(tmp_path: Path) -> None:
     async with running(tmp_path) as (machine, loop):
         with pytest.raises(DeviceRefusedError, match=r"90\.0 deg"):
@@ -82,6 +108,7 @@ async def test_it_refuses_what_an_operator_would_be_refused(tmp_path: Path) -> N
             await turn(loop, 5.0)
 
 
+@in_simulated_time
 async def test_an_arming_that_fails_says_why(tmp_path: Path) -> None:
     async with running(tmp_path) as (machine, loop):
         machine.rotation.refuse_arm = DeviceRefusedError("rotation", "limits did not read back")
@@ -104,10 +131,11 @@ def port_of(machine: FakeMachine, loop: ControlLoop) -> Port:
 async def until(reached: Callable[[], bool]) -> None:
     async with asyncio.timeout(10.0):
         while not reached():
-            await asyncio.sleep(0)
+            await asyncio.sleep(0.001)
 
 
 @pytest.mark.parametrize("begun", ["while it arms", "under way"])
+@in_simulated_time
 async def test_it_ends_with_the_client_that_asked(tmp_path: Path, begun: str) -> None:
     async with running(tmp_path) as (machine, loop):
         task = asyncio.create_task(port_of(machine, loop).service("rotation.turn", {"consent": True}))
@@ -127,6 +155,7 @@ async def test_it_ends_with_the_client_that_asked(tmp_path: Path, begun: str) ->
         assert loop.tick.state.mode is Mode.DISARMED
 
 
+@in_simulated_time
 async def test_one_at_a_time(tmp_path: Path) -> None:
     async with running(tmp_path) as (machine, loop):
         port = port_of(machine, loop)
@@ -142,6 +171,7 @@ async def test_one_at_a_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("consent", ["false", "no", [0], -1, 1, 1.0, None])
+@in_simulated_time
 async def test_consent_is_true(tmp_path: Path, consent: Any) -> None:
     async with running(tmp_path) as (machine, loop):
         with pytest.raises(ServiceError, match="may move"):

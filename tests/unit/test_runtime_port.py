@@ -10,8 +10,8 @@ import pytest
 from graderd.api.port import ServiceError
 from graderd.config import Config
 from graderd.core.machine import Mode
+from graderd.hal.device import DeviceService
 from graderd.hal.errors import DeviceTimeoutError
-from graderd.hal.service import DeviceService
 from graderd.runtime.port import Port
 
 

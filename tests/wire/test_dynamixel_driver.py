@@ -12,8 +12,8 @@ from graderd.drivers.dynamixel import Ph54Rotator, ServoBus
 from graderd.drivers.dynamixel.codec import Instruction, Packet, StatusError, StreamDecoder
 from graderd.drivers.dynamixel.device import Ph54Device
 from graderd.drivers.dynamixel.table import ControlTable
+from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceError, DeviceTimeoutError
-from graderd.hal.lifecycle import Lifecycle
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
 from harness.awake_clock import AwakeClock

@@ -30,7 +30,7 @@ def run_guard(config_path: Path | None) -> int:
 
 
 def problems(config: Config) -> list[str]:
-    """See :func:`graderd.runtime.app.check.problems`."""
-    from graderd.runtime.app.check import problems as find
+    """See :func:`graderd.runtime.app.devices.problems`."""
+    from graderd.runtime.app.devices import problems as find
 
     return find(config)

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from graderd.config import ConfigError, load
-from graderd.drivers.electrak.dbc import machine_database
+from graderd.drivers.electrak.codec import machine_database
 from graderd.hal.settings import ElectrakSettings
 
 

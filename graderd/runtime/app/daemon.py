@@ -18,16 +18,14 @@ from graderd.core import commands as cmd
 from graderd.core.machine import Mode
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
-from graderd.runtime.app.check import problems
-from graderd.runtime.app.devices import build_devices, build_stop_input
-from graderd.runtime.app.hang_watch import HangWatch
+from graderd.runtime.app.devices import build_devices, build_stop_input, problems
 from graderd.runtime.app.journal import set_up_logging
 from graderd.runtime.app.last_run import remember
 from graderd.runtime.app.services import build_services
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import open_devices
-from graderd.runtime.health import HealthWatch
+from graderd.runtime.health import HangWatch, HealthWatch
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 from graderd.runtime.port import Port
 from graderd.runtime.recorder import Recorder

@@ -1,10 +1,14 @@
-"""Builds the devices that the configuration names."""
+"""Builds the devices that the configuration names, and says what of it this installation cannot do."""
 
 from __future__ import annotations
 
+import grp
+import os
 from collections.abc import Callable
+from pathlib import Path
 
-from graderd.config import Config
+from graderd.api.server import MAX_PATH_BYTES
+from graderd.config import Config, ConfigError
 from graderd.drivers.backend import Parts
 from graderd.drivers.j1939.bus_health import BusEvent
 from graderd.drivers.j1939.can_logs import candump_line
@@ -12,12 +16,13 @@ from graderd.drivers.j1939.ids import Frame
 from graderd.drivers.j1939.link import CanLink
 from graderd.drivers.j1939.vehicle import J1939Vehicle
 from graderd.drivers.simulated.vehicle import SimulatedVehicle
-from graderd.hal.clock import Clock
+from graderd.hal.clock import Clock, SystemClock
+from graderd.hal.device import DeviceService
+from graderd.hal.errors import DeviceError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.linear_actuator import LinearActuator
-from graderd.hal.service import DeviceService
 from graderd.hal.vehicle import Vehicle
-from graderd.runtime.app.backends import actuator_of, rotator_of, stop_input_of
+from graderd.runtime.app.backends import actuator_of, check_plugins, rotator_of, stop_input_of
 from graderd.runtime.devices import Devices
 from graderd.runtime.stop_input import StopInputWatch
 
@@ -90,3 +95,29 @@ def build_stop_input(config: Config, clock: Clock, on_stop: Callable[[str], None
         return None
     backend, settings = named
     return StopInputWatch(settings, backend.build(settings), clock, on_stop)
+
+
+def problems(config: Config) -> list[str]:
+    """What a valid configuration may ask that this installation cannot do: `run` and `config check` refuse the same.
+
+    A line each with place, cause and remedy; nothing is opened, whatever is or is not plugged in.
+    """
+    found = []
+    clock = SystemClock()
+    try:
+        check_plugins(config)
+        build_devices(config, clock, on_bus_stop=lambda _: None)
+        build_stop_input(config, clock, on_stop=lambda _: None)
+    except ConfigError as error:
+        found += error.problems
+    except (DeviceError, LookupError) as error:
+        found.append(" ".join(str(error).split()))
+    api = config.api
+    if not Path(api.socket).name or len(os.fsencode(api.socket)) > MAX_PATH_BYTES:
+        found.append(f"api.socket: {api.socket!r} is no path of 1 to {MAX_PATH_BYTES} bytes. Choose a shorter one")
+    if api.socket_group:
+        try:
+            grp.getgrnam(api.socket_group)
+        except KeyError:
+            found.append(f"api.socket_group: there is no group {api.socket_group}. Create it, or name another")
+    return found

@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 import asyncio
+import atexit
 import base64
+import os
+import shutil
+import tempfile
 from dataclasses import asdict
 from datetime import UTC, datetime
-from functools import partial
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field
 
 from graderd.config import Config
-from graderd.drivers.dynamixel.step import StepSample, analyse, render
+from graderd.hal.device import DeviceService
 from graderd.hal.errors import CommandRangeError, DeviceMissingError, DeviceRefusedError
 from graderd.hal.rotator import Rotator
-from graderd.hal.service import DeviceService
-from graderd.hal.settings import Finite, Ph54Settings, Positive, RotatorSettings, Settings
-from graderd.runtime.app.calibration_frames import CalibrationFrames
+from graderd.hal.settings import Finite, Positive, Settings
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
 from graderd.runtime.maneuver import Maneuver
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
+from graderd.runtime.step_response import analyse, render, step_samples
 
-STEP_SHARES = (1.0, 0.5, 0.0, 0.5, 0.0)
-"""Up, half-way down, down, half-way up, back: the half-way goal is reached from both sides, which shows backlash."""
 SETTLE_S = 0.5
+_PREFIX = "calibration-"
 
 
 class StepArguments(Settings):
@@ -45,6 +47,61 @@ class FileArguments(Settings):
     """Arguments of ``camera.calibration_file``."""
 
     file: str
+
+
+class CalibrationFrames:
+    """Pictures of the empty blade on their way to the client: they travel over the interface, not through the file
+    system, so that the rights of the socket decide who gets them, whoever asks and wherever the daemon may write.
+
+    At most one frame set, in the daemon's own directory; each file goes when it was fetched, the rest with the next set
+    or with the daemon. ``configured``: ``state.directory``.
+    """
+
+    def __init__(self, configured: str = "") -> None:
+        self._base = os.environ.get("STATE_DIRECTORY") or configured or None
+        self._folder: Path | None = None
+        atexit.register(self.discard)
+        if self._base is not None:  # what a killed daemon left
+            for left in Path(self._base).glob(f"{_PREFIX}*"):
+                shutil.rmtree(left, ignore_errors=True)
+
+    def begin(self) -> Path:
+        """An empty folder for a new set; a former one goes.
+
+        Raises:
+            OSError: it cannot be made.
+        """
+        self.discard()
+        if self._base is not None:
+            Path(self._base).mkdir(parents=True, exist_ok=True)
+        self._folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=self._base))
+        return self._folder
+
+    def names(self) -> list[str]:
+        """The files that were not fetched yet."""
+        return sorted(os.listdir(self._folder)) if self._folder is not None else []
+
+    def take(self, name: str) -> bytes:
+        """The content of one file, which then goes.
+
+        Raises:
+            CommandRangeError: there is no such file.
+        """
+        names = self.names()
+        if self._folder is None or name not in names:
+            raise CommandRangeError("file", f"no file {name!r} waits", "Calibrate again")
+        path = self._folder / name
+        data = path.read_bytes()
+        path.unlink()
+        if names == [name]:
+            self.discard()
+        return data
+
+    def discard(self) -> None:
+        """Remove what is there; idempotent."""
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder = None
 
 
 def build_services(
@@ -84,56 +141,17 @@ def build_services(
 
 
 async def _step_response(config: Config, rotator: Rotator, loop: ControlLoop, wanted: StepArguments) -> dict[str, Any]:
-    """Steps through machine and gate: what is measured is what the blade does in operation."""
-    samples: list[StepSample] = []
-    async with Maneuver(loop) as blade:
-        start_deg = loop.tick.pose.rotation_deg
-        if start_deg is None:
-            raise DeviceMissingError("rotation", "no fresh measurement to start from")
-        began_s = loop.tick.now_s
-
-        def sample(goal_deg: float) -> None:
-            told = rotator.telemetry()
-            if told.angle_deg and told.velocity_deg_per_s:
-                samples.append(
-                    StepSample(
-                        told.angle_deg.time_s - began_s,
-                        goal_deg,
-                        told.angle_deg.value,
-                        told.velocity_deg_per_s.value,
-                        told.current_a.value if told.current_a else None,
-                    )
-                )
-
-        for share in (0.0, *STEP_SHARES):
-            goal_deg = start_deg + share * wanted.step_deg
-            await blade.rotate_to(goal_deg, wanted.dwell_s, partial(sample, goal_deg))
-    rotation = config.rotation
-    settings = {
-        "goal's speed": f"{rotation.speed_deg_per_s:g} deg/s",
-        "goal's acceleration": f"{rotation.acceleration_deg_per_s2:g} deg/s²",
-        "driver": rotation.backend,
-        **_own_figures(rotation),
-        "simulated": "yes" if config.simulated else "no",
-    }
-    recording = analyse(samples, rotation.tolerance_deg, settings)
+    """Steps, analysed, with the settings in force and a page to keep."""
+    samples = await step_samples(loop, rotator, wanted.step_deg, wanted.dwell_s)
+    settings = {name: str(value) for name, value in config.rotation.model_dump().items()}
+    settings["simulated"] = "yes" if config.simulated else "no"
+    recording = analyse(samples, config.rotation.tolerance_deg, settings)
     return {
         "steps": [asdict(step) for step in recording.steps],
         "backlash_deg": recording.backlash_deg,
         "backlash_from": recording.backlash_from,
         "settings": settings,
         "report_html": render(recording, when=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
-    }
-
-
-def _own_figures(rotation: RotatorSettings) -> dict[str, str]:
-    """What the driver itself holds to, where it is one that has such settings."""
-    if not isinstance(rotation, Ph54Settings):
-        return {}
-    return {
-        "profile velocity": f"{rotation.profile_velocity_deg_per_s:g} deg/s",
-        "profile acceleration": f"{rotation.profile_acceleration_deg_per_s2:g} deg/s²",
-        "current limit": f"{rotation.current_limit_a:g} A" if rotation.current_limit_a else "the servo's rating",
     }
 
 

@@ -1,33 +1,33 @@
-"""Step response: a small manoeuvre that shows how the blade follows, and the numbers that tuning needs."""
+"""Step response: a small manoeuvre that shows how the blade follows, the numbers that tuning needs, and their page."""
 
 from __future__ import annotations
 
-import asyncio
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from html import escape
 from itertools import pairwise
 
-from graderd.drivers.dynamixel.ph54 import Ph54Rotator
-from graderd.hal.errors import CommandRangeError, DeviceLostError, LifecycleError
-from graderd.hal.lifecycle import Lifecycle
+from graderd.hal.errors import DeviceMissingError
+from graderd.hal.rotator import Rotator
+from graderd.runtime.control import ControlLoop
+from graderd.runtime.maneuver import Maneuver
 
-_RENEW_S = 0.02
+SHARES = (0.0, 1.0, 0.5, 0.0, 0.5, 0.0)
+"""Of the step: up, half-way down, down, half-way up, back. Half-way is reached from both sides, which shows play."""
 _SETTLED_TAIL_S = 0.3
 """The settled angle is the mean over the last part of a dwell."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepSample:
-    """One telemetry read of the manoeuvre; times from its start. ``reference_deg``: an independent angle, if any."""
+    """One telemetry read of the manoeuvre; times from its start."""
 
     time_s: float
     goal_deg: float
     angle_deg: float
-    velocity_deg_per_s: float
     current_a: float | None
-    reference_deg: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +53,9 @@ class StepMetrics:
 class StepRecording:
     """A whole manoeuvre: samples, the settings in force, and what was made of it.
 
-    ``backlash_deg``: at one and the same goal, what differs between arriving from above and from below. With a
-    reference (rig shaft, camera) it is the play between servo and blade; without one it is the servo's own hysteresis,
-    because its encoder sits on the motor's side of the gear.
+    ``backlash_deg``: at one and the same goal, what differs between arriving from above and from below: hysteresis as
+    the rotator's own encoder sees it, which may sit on the motor's side of the gear. ``backlash_from``: ``encoder``,
+    or ``none`` where no angle was reached from both sides.
     """
 
     samples: tuple[StepSample, ...]
@@ -65,71 +65,39 @@ class StepRecording:
     settings: dict[str, str] = field(default_factory=dict)
 
 
-async def step_response(
-    rotator: Ph54Rotator,
-    amplitude_deg: float = 10.0,
-    dwell_s: float = 2.0,
-    *,
-    reference_deg: Callable[[], float] | None = None,
-) -> StepRecording:
-    """Run the manoeuvre on an armed rotator: up, half-way down, down, half-way up, back. The caller has consent.
+async def step_samples(loop: ControlLoop, rotator: Rotator, step_deg: float, dwell_s: float) -> list[StepSample]:
+    """Run the manoeuvre through machine and gate: what is measured is what the blade does in operation.
 
-    It starts and ends at the present angle; ``amplitude_deg`` may be negative. Any fault of the wire ends it with
-    the driver's own reaction; leaving early (cancel, error) holds.
+    It arms, starts and ends at the present angle, stays ``dwell_s`` from the start of each move, and disarms.
 
     Raises:
-        LifecycleError: not active, or no longer.
-        CommandRangeError: an angle of the manoeuvre is outside the soft limits; nothing was moved.
-        DeviceLostError: the servo was lost under way.
+        DeviceMissingError: no fresh angle to start from.
+        DeviceRefusedError: not ready, or an angle of the manoeuvre is beyond a limit.
+        DeviceLostError: the machine left manual mode (stop, fault) under way.
     """
-    if rotator.lifecycle is not Lifecycle.ACTIVE:
-        raise LifecycleError(
-            "rotation", f"a step response needs the state active, it is {rotator.lifecycle}", "Arm first"
-        )
-    first = (await rotator.wait_telemetry()).angle_deg
-    if first is None or amplitude_deg == 0 or dwell_s <= _SETTLED_TAIL_S:
-        raise CommandRangeError("rotation", f"no step of {amplitude_deg}° with a dwell of {dwell_s} s is possible")
-    start_deg = first.value
-    goals = [start_deg + share * amplitude_deg for share in (0.0, 1.0, 0.5, 0.0, 0.5, 0.0)]
-    for goal_deg in goals:
-        if not rotator.calibration.within_limits(goal_deg):
-            raise CommandRangeError(
-                "rotation", f"the manoeuvre goes to {goal_deg:.1f}°, outside the limits", "Start elsewhere"
-            )
     samples: list[StepSample] = []
-    began_s = first.time_s
-    try:
-        for goal_deg in goals:
-            await _dwell(rotator, goal_deg, dwell_s, began_s, samples, reference_deg)
-    finally:
-        rotator.hold()
-    return analyse(samples, rotator.settings.tolerance_deg, _settings_used(rotator))
+    async with Maneuver(loop) as blade:
+        start_deg = loop.tick.pose.rotation_deg
+        if start_deg is None:
+            raise DeviceMissingError("rotation", "no fresh measurement to start from")
+        began_s = loop.tick.now_s
 
+        def sample(goal_deg: float) -> None:
+            told = rotator.telemetry()
+            if told.angle_deg:
+                samples.append(
+                    StepSample(
+                        told.angle_deg.time_s - began_s,
+                        goal_deg,
+                        told.angle_deg.value,
+                        told.current_a.value if told.current_a else None,
+                    )
+                )
 
-async def _dwell(
-    rotator: Ph54Rotator,
-    goal_deg: float,
-    dwell_s: float,
-    began_s: float,
-    samples: list[StepSample],
-    reference_deg: Callable[[], float] | None,
-) -> None:
-    loop = asyncio.get_running_loop()
-    until_s = loop.time() + dwell_s
-    while loop.time() < until_s:
-        rotator.set_goal_deg(goal_deg)
-        try:
-            async with asyncio.timeout(_RENEW_S * 5):
-                t = await rotator.wait_telemetry()
-        except TimeoutError:
-            continue
-        if t.angle_deg is None or t.velocity_deg_per_s is None or t.current_a is None:
-            raise DeviceLostError("rotation", "no telemetry during the step response")
-        reference = reference_deg() if reference_deg is not None else None
-        at_s = t.angle_deg.time_s - began_s
-        samples.append(
-            StepSample(at_s, goal_deg, t.angle_deg.value, t.velocity_deg_per_s.value, t.current_a.value, reference)
-        )
+        for share in SHARES:
+            goal_deg = start_deg + share * step_deg
+            await blade.rotate_to(goal_deg, dwell_s, partial(sample, goal_deg))
+    return samples
 
 
 def analyse(samples: Sequence[StepSample], tolerance_deg: float, settings: dict[str, str]) -> StepRecording:
@@ -193,25 +161,8 @@ def _backlash(parts: Sequence[Sequence[StepSample]]) -> tuple[float, str]:
     for both in sides.values():
         if len(both) == 2:
             below, above = _tail(both[True]), _tail(both[False])
-            if all(s.reference_deg is not None for s in (*below, *above)):
-                slack = [_mean([s.angle_deg - (s.reference_deg or 0.0) for s in tail]) for tail in (below, above)]
-                return abs(slack[0] - slack[1]), "reference"
             return abs(_mean([s.angle_deg for s in below]) - _mean([s.angle_deg for s in above])), "encoder"
     return 0.0, "none"
-
-
-def _settings_used(rotator: Ph54Rotator) -> dict[str, str]:
-    s = rotator.settings
-    return {
-        "servo": f"{rotator.table.title}, firmware {rotator.firmware_version}",
-        "velocity": f"{s.profile_velocity_deg_per_s:g} °/s",
-        "acceleration": f"{s.profile_acceleration_deg_per_s2:g} °/s²",
-        "current limit": f"{rotator.calibration.current_limit_a:g} A",
-        "gear ratio": f"{s.gear_ratio:g}",
-        "zero and sign": f"{s.zero_deg:g}°, {s.sign:+d}",
-        "poll rate": f"{s.poll_hz:g} Hz at {s.baud_n} bit/s",
-        "tolerance": f"±{s.tolerance_deg:g}°",
-    }
 
 
 _WIDTH, _HEIGHT = 860, 260
@@ -248,7 +199,6 @@ def render(recording: StepRecording, *, title: str = "Step response of the blade
     rows = "".join(_row(step) for step in recording.steps)
     used = "".join(f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in recording.settings.items())
     source = {
-        "reference": "play between servo and blade, from an independent angle",
         "encoder": "hysteresis of the servo's own encoder; the gear's play behind it does not show here",
         "none": "not measured: no angle was approached from both sides",
     }[recording.backlash_from]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 
-from graderd.hal.repeats import BURST_N, RepeatFilter
+from graderd.runtime.app.journal import BURST_N, RepeatFilter
 
 
 class Log:

@@ -1,12 +1,29 @@
-"""A service of a device outside the control loop: something a person asks for, such as a reboot or a comparison."""
+"""What all devices share: the states they go through, and services that a person asks for beside the control loop."""
 
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 from graderd.hal.settings import Settings
+
+
+class Lifecycle(StrEnum):
+    """The four states every device goes through, ``closed -> standby -> active``, and ``failed`` from any of them.
+
+    * CLOSED: the wire is not open.
+    * STANDBY: open, identified and readable; unpowered, or powered and forbidden to move.
+    * ACTIVE: may move when commanded.
+    * FAILED: the wire or the device is lost or refuses; the driver keeps trying to get back to STANDBY
+      (never to ACTIVE: that takes an arm).
+    """
+
+    CLOSED = "closed"
+    STANDBY = "standby"
+    ACTIVE = "active"
+    FAILED = "failed"
 
 
 class NoArguments(Settings):
