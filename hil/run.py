@@ -44,7 +44,7 @@ class Kernel:
 
     path: Path = uml.KERNEL
     arguments: tuple[str, ...] = ()
-    patience: float = 1.0
+    timeout_factor: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ def in_guest(part: Part, package: Path, tree: Path, kernel: Kernel, *, follow: b
         command,
         out,
         directory=PROJECT,
-        timeout_s=part.timeout_s * kernel.patience,
+        timeout_s=part.timeout_s * kernel.timeout_factor,
         kernel=kernel.path,
         kernel_args=kernel.arguments,
         place_n=part.place_n,

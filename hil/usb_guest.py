@@ -25,7 +25,7 @@ OUT: Final = Path(os.environ.get("HIL_OUT", "/run/hil-out"))
 SERVO: Final = Path("/dev/graderd/servo")
 SERIAL: Final = "FT4U2D2A"
 OURS, THEIRS = "can0", "can1"
-# The machine is emulated, ten to fifty times slower than a computer. Longer patience, and no pictures to look at.
+# The machine is emulated, ten to fifty times slower than a computer. Longer deadlines, and no pictures to look at.
 SETTINGS: Final[dict[str, object]] = {
     "rotation.port": str(SERVO),
     "rotation.poll_hz": 10.0,
@@ -54,7 +54,7 @@ SETTINGS: Final[dict[str, object]] = {
     "camera.restart_s": 600.0,
     "can.channel": OURS,
 }
-PATIENCE_S: Final = 180.0
+TIMEOUT_S: Final = 180.0
 TOLD_S: Final = 5.0
 
 
@@ -125,7 +125,7 @@ def ready(grader: Grader) -> None:
             all(a["lifecycle"] == "standby" for a in s["axes"].values())
             and all(r["met"] for r in s["readiness"] if r["mandatory"])
         ),
-        PATIENCE_S,
+        TIMEOUT_S,
     )
 
 
@@ -145,7 +145,7 @@ def set_up() -> None:
     drop_in = Path("/etc/systemd/system/graderd.service.d/hil.conf")
     drop_in.parent.mkdir(parents=True, exist_ok=True)
     drop_in.write_text("[Service]\nWatchdogSec=30\nTimeoutStartSec=300\nTimeoutStopSec=60\n", encoding="utf-8")
-    run("systemctl", "daemon-reload", timeout_s=PATIENCE_S)
+    run("systemctl", "daemon-reload", timeout_s=TIMEOUT_S)
 
 
 def main() -> int:
@@ -162,17 +162,17 @@ def main() -> int:
         assert found["latency_ms"] == 1, found
     with report.step("an adapter that was there first gets its name when the package is configured"):
         SERVO.unlink()
-        run("/var/lib/dpkg/info/graderd.postinst", "configure", timeout_s=PATIENCE_S)
+        run("/var/lib/dpkg/info/graderd.postinst", "configure", timeout_s=TIMEOUT_S)
         wait_for(str(SERVO), SERVO.exists, 30.0)
     with report.step("graderd-can@ sets the far controller up") as found:
-        run("systemctl", "start", f"graderd-can@{THEIRS}.service", timeout_s=PATIENCE_S)
+        run("systemctl", "start", f"graderd-can@{THEIRS}.service", timeout_s=TIMEOUT_S)
         found |= link(THEIRS)
     actuators = ("-I", "-m", "graderd.simulator.actuators", f"--can={THEIRS}")
-    run("systemd-run", "--quiet", "--unit=hil-actuators.service", PYTHON, *actuators, timeout_s=PATIENCE_S)
+    run("systemd-run", "--quiet", "--unit=hil-actuators.service", PYTHON, *actuators, timeout_s=TIMEOUT_S)
     with report.step("the service starts, sets its own controller up and finds all four axes") as found:
         grader.configure(SETTINGS)
-        run("systemctl", "daemon-reload", timeout_s=PATIENCE_S)
-        run("systemctl", "restart", grader.unit.name, timeout_s=PATIENCE_S)
+        run("systemctl", "daemon-reload", timeout_s=TIMEOUT_S)
+        run("systemctl", "restart", grader.unit.name, timeout_s=TIMEOUT_S)
         ready(grader)
         found |= link(OURS)
         assert {key: found[key] for key in ("bitrate", "restart_ms", "state", "queue")} == {
@@ -191,7 +191,7 @@ def main() -> int:
     with report.step("plugged in again: same name, same latency, nothing moves, armed and turned again") as found:
         host("plug")
         found["back_s"] = within(
-            "the servo", grader, lambda s: s["axes"]["rotation"]["lifecycle"] == "standby", PATIENCE_S
+            "the servo", grader, lambda s: s["axes"]["rotation"]["lifecycle"] == "standby", TIMEOUT_S
         )
         found["latency_ms"] = latency_ms()
         assert found["latency_ms"] == 1, found

@@ -111,7 +111,7 @@ class ControlServer:
             case Light():
                 changes = command.model_dump(exclude={"cmd"}, exclude_none=True)
                 appearance = Appearance(**{**self._appearance.model_dump(), **changes})
-                await self._camera.tell({"look": appearance.model_dump()})
+                await self._camera.tell({"appearance": appearance.model_dump()})
                 self._appearance = appearance
                 return {"ok": True, "light": appearance.model_dump()}
             case CameraFault():

@@ -28,7 +28,7 @@ class LinkedTerminal:
         tty.setraw(self.master)
         os.set_blocking(self.master, False)
         name = os.ttyname(self.slave)
-        self._keeper = subprocess.Popen(
+        self._holder = subprocess.Popen(
             ["/bin/sh", "-c", _TAKE_AWAY, "sh", str(link), name],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
@@ -47,7 +47,7 @@ class LinkedTerminal:
             self._link.unlink()
         os.close(self.slave)
         os.close(self.master)
-        self._keeper.kill()
-        self._keeper.wait()
-        assert self._keeper.stdin is not None
-        self._keeper.stdin.close()
+        self._holder.kill()
+        self._holder.wait()
+        assert self._holder.stdin is not None
+        self._holder.stdin.close()

@@ -23,7 +23,7 @@ from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
 from harness.awake_clock import AwakeClock
 
-PATIENCE_S = 15.0
+TIMEOUT_S = 15.0
 """Deadline of waits in tests: long, because the machine may be busy; nothing is measured by it."""
 
 
@@ -43,11 +43,11 @@ class Bench:
         judged = self.monitor.judge(() if sample is None else (sample,), self.clock.now_s())
         return {f.condition for f in (*self.rotator.faults(), *judged)}
 
-    async def until(self, met: Callable[[], object], what: str = "", timeout_s: float = PATIENCE_S) -> None:
+    async def until(self, met: Callable[[], object], what: str = "", timeout_s: float = TIMEOUT_S) -> None:
         """Wait until ``met()`` is true, looking every few milliseconds."""
         await until(met, what or f"not met; faults {self.conditions()}", timeout_s)
 
-    async def drive(self, goal_deg: float, met: Callable[[], object], timeout_s: float = PATIENCE_S) -> None:
+    async def drive(self, goal_deg: float, met: Callable[[], object], timeout_s: float = TIMEOUT_S) -> None:
         """Renew a goal every 20 ms, as the control tick does, until ``met()`` is true."""
         deadline_s = time.monotonic() + timeout_s
         while not met():
@@ -96,7 +96,7 @@ def standing(rig: Bench) -> bool:
     return abs(rig.servo.shaft_velocity_deg_per_s) < 0.5
 
 
-async def until(met: Callable[[], object], what: str, timeout_s: float = PATIENCE_S) -> None:
+async def until(met: Callable[[], object], what: str, timeout_s: float = TIMEOUT_S) -> None:
     deadline_s = time.monotonic() + timeout_s
     while not met():
         assert time.monotonic() < deadline_s, what
@@ -155,7 +155,7 @@ class ServoProcess:
 
     def end(self) -> int:
         self.process.terminate()
-        code = self.process.wait(timeout=PATIENCE_S)
+        code = self.process.wait(timeout=TIMEOUT_S)
         for pipe in (self.process.stdin, self.process.stdout):
             if pipe is not None:
                 pipe.close()

@@ -68,14 +68,14 @@ class Ph54Rotator:
         self._link = ServoLink(settings, self.table, self._mode, self._clock, list_ports)
         self._observer = ServoObserver(DEVICE, settings, self.table, self.calibration, self._clock)
         self._command = CommandSlot(settings, self.calibration)
-        self._keeper = ServoTask(settings, self._link, self._observer, self._command, self._clock)
+        self._task = ServoTask(settings, self._link, self._observer, self._command, self._clock)
 
     # -- what it is -------------------------------------------------------------------------------------------
 
     @property
     def lifecycle(self) -> Lifecycle:
         """Present lifecycle state."""
-        return self._keeper.lifecycle
+        return self._task.lifecycle
 
     @property
     def port(self) -> str | None:
@@ -103,7 +103,7 @@ class Ph54Rotator:
 
     async def wait_telemetry(self) -> RotatorTelemetry:
         """The next telemetry, as soon as it was read (or the connection's state changed)."""
-        await self._keeper.next_poll()
+        await self._task.next_poll()
         return self._observer.telemetry
 
     # -- lifecycle --------------------------------------------------------------------------------------------
@@ -112,18 +112,18 @@ class Ph54Rotator:
         """closed -> standby. See :meth:`graderd.hal.rotator.Rotator.open`; on an error it is closed again."""
         self._require(Lifecycle.CLOSED)
         self._observer.faults.clear(*LINK_FAULTS)
-        self._keeper.torque_is_ours = False
+        self._task.torque_is_ours = False
         self._command.forget()
         try:
-            async with self._keeper.turn:
-                await self._keeper.connect()
+            async with self._task.wire_lock:
+                await self._task.connect()
         except BaseException as e:
             self._link.disconnect()
             if isinstance(e, DeviceError):
                 self._observer.faults.set(condition_of(e), e.cause, self._clock.now_s())
             raise
-        self._keeper.note(Event.OPENED)
-        self._keeper.start()
+        self._task.note(Event.OPENED)
+        self._task.start()
 
     async def arm(self) -> None:
         """standby -> active. See :meth:`graderd.hal.rotator.Rotator.arm`."""
@@ -132,25 +132,25 @@ class Ph54Rotator:
             raise DeviceRefusedError(
                 DEVICE, "whole turns were lost, the angle is ambiguous", "Check the blade, then confirm the turns"
             )
-        async with self._keeper.turn:
+        async with self._task.wire_lock:
             self._require(Lifecycle.STANDBY)
             device = self._link.device
-            self._keeper.torque_is_ours = True
+            self._task.torque_is_ours = True
             armed = await arming.power_up(device, self.settings, self.calibration)
-            if self._keeper.lifecycle is not Lifecycle.STANDBY:  # closed in the meantime
+            if self._task.lifecycle is not Lifecycle.STANDBY:  # closed in the meantime
                 await device.torque(False)
-                raise LifecycleError(DEVICE, f"became {self._keeper.lifecycle} while it was being armed")
+                raise LifecycleError(DEVICE, f"became {self._task.lifecycle} while it was being armed")
             self._command.armed(armed)
             self._observer.note_sent(armed.goal_counts)
             self._observer.restart()
             self._observer.set_torque(True)
             self._observer.tripped = False
-            self._keeper.note(Event.ARMED)
+            self._task.note(Event.ARMED)
 
     def set_goal_deg(self, goal_deg: float) -> None:
         """Take a new goal; sent at once by the driver's own task. See :meth:`graderd.hal.rotator.Rotator`."""
-        if self._keeper.lifecycle is not Lifecycle.ACTIVE:
-            raise LifecycleError(DEVICE, f"a goal needs the state active, it is {self._keeper.lifecycle}", "Arm first")
+        if self._task.lifecycle is not Lifecycle.ACTIVE:
+            raise LifecycleError(DEVICE, f"a goal needs the state active, it is {self._task.lifecycle}", "Arm first")
         if not self.calibration.within_limits(goal_deg):
             raise CommandRangeError(
                 DEVICE,
@@ -158,33 +158,33 @@ class Ph54Rotator:
                 "Choose an angle inside them",
             )
         self._command.goal(goal_deg, self._clock.now_s())
-        self._keeper.wake()
+        self._task.wake()
 
     def hold(self) -> None:
         """Stop with the next packet, as soon as the blade can without turning back. Allowed always, idempotent."""
         self._command.hold()
-        self._keeper.wake()
+        self._task.wake()
 
     async def disarm(self) -> None:
         """active -> standby: hold, come to rest, then torque as ``torque_at_disarm`` says. Elsewhere: nothing to do."""
-        if self._keeper.lifecycle is not Lifecycle.ACTIVE:
+        if self._task.lifecycle is not Lifecycle.ACTIVE:
             return
-        self._keeper.note(Event.DISARMED)
-        await self._keeper.power_down(off=self.settings.torque_at_disarm == "off")
+        self._task.note(Event.DISARMED)
+        await self._task.power_down(off=self.settings.torque_at_disarm == "off")
 
     async def close(self) -> None:
         """Any state -> closed: torque as ``torque_at_exit`` says where it was switched on by us, then let go."""
-        if self._keeper.lifecycle is Lifecycle.CLOSED:
+        if self._task.lifecycle is Lifecycle.CLOSED:
             return
-        was = self._keeper.lifecycle
-        self._keeper.note(Event.CLOSED)
-        if was is not Lifecycle.FAILED and self._keeper.torque_is_ours and self._observer.torque_on:
+        was = self._task.lifecycle
+        self._task.note(Event.CLOSED)
+        if was is not Lifecycle.FAILED and self._task.torque_is_ours and self._observer.torque_on:
             try:
                 async with asyncio.timeout(_CLOSE_S):
-                    await self._keeper.power_down(off=self.settings.torque_at_exit == "off", leaving=True)
+                    await self._task.power_down(off=self.settings.torque_at_exit == "off", leaving=True)
             except (DeviceError, TimeoutError) as e:
                 log.error("%s: could not be made safe at exit (%s); its bus watchdog stops it", DEVICE, e, extra=FIELDS)
-        await self._keeper.stop()
+        await self._task.stop()
 
     async def reboot(self) -> None:
         """Reboot the servo (clears a latched hardware error) and bring it back to standby. The caller has consent.
@@ -195,19 +195,19 @@ class Ph54Rotator:
             WrongDeviceError: it came back with settings that do not fit.
         """
         self._require(Lifecycle.STANDBY)
-        async with self._keeper.turn:
+        async with self._task.wire_lock:
             self._require(Lifecycle.STANDBY)
-            self._keeper.note(Event.LOST)
-            self._keeper.torque_is_ours = False
+            self._task.note(Event.LOST)
+            self._task.torque_is_ours = False
             try:
                 await self._link.reboot()
-                await self._keeper.look_around(self._link.device)
+                await self._task.first_readings(self._link.device)
             except DeviceError as e:
                 self._observer.faults.set(condition_of(e), e.cause, self._clock.now_s())
                 if self._link.bus is not None:
                     self._link.bus.close()  # the servo task finds the line closed and starts anew
                 raise
-            self._keeper.note(Event.FOUND)
+            self._task.note(Event.FOUND)
 
     async def verify_profile(self) -> list[Difference]:
         """Read every register and compare it with the firmware profile and what arming writes; reads only.
@@ -220,7 +220,7 @@ class Ph54Rotator:
         written = arming.eeprom_counts(self.calibration)
         if self._link.is_up:  # polling goes on between the reads
             return await self._link.device.verify(self._mode, written)
-        async with self._keeper.turn, self._link.visit() as device:
+        async with self._task.wire_lock, self._link.visit() as device:
             return await device.verify(self._mode, written)
 
     async def scan(self) -> list[Found]:
@@ -230,10 +230,10 @@ class Ph54Rotator:
             LifecycleError: active.
             DeviceMissingError: there is no port.
         """
-        if self._keeper.lifecycle is Lifecycle.ACTIVE:
+        if self._task.lifecycle is Lifecycle.ACTIVE:
             raise LifecycleError(DEVICE, "cannot look for others while it is armed", "Disarm first")
-        async with self._keeper.turn:
-            self._keeper.note(Event.LOST)
+        async with self._task.wire_lock:
+            self._task.note(Event.LOST)
             return await self._link.scan()
 
     def confirm_turns(self) -> None:
@@ -247,5 +247,5 @@ class Ph54Rotator:
             raise CommandRangeError(f"settings of {DEVICE}", cause, f"Profile: {self.table.name}")
 
     def _require(self, state: Lifecycle) -> None:
-        if self._keeper.lifecycle is not state:
-            raise LifecycleError(DEVICE, f"needs the state {state}, it is {self._keeper.lifecycle}")
+        if self._task.lifecycle is not state:
+            raise LifecycleError(DEVICE, f"needs the state {state}, it is {self._task.lifecycle}")

@@ -210,7 +210,7 @@ class ServoTask:
     ) -> None:
         self._state = Lifecycle.CLOSED
         self.torque_is_ours = False
-        self.turn = asyncio.Lock()
+        self.wire_lock = asyncio.Lock()
         self._settings = settings
         self._calibration = command.calibration
         self._link = link
@@ -266,16 +266,16 @@ class ServoTask:
     # -- connection -------------------------------------------------------------------------------------------
 
     async def connect(self) -> None:
-        """Find and identify the servo, and look around; nothing moves and torque is left as it is.
+        """Find and identify the servo, and take its first readings; nothing moves and torque is left as it is.
 
         Raises:
             DeviceError: see :meth:`ServoLink.connect`.
         """
         self._observer.new_wire()
-        await self.look_around(await self._link.connect())
+        await self.first_readings(await self._link.connect())
         self._observer.faults.clear(*LINK_FAULTS)
 
-    async def look_around(self, device: Ph54Device) -> None:
+    async def first_readings(self, device: Ph54Device) -> None:
         """First readings of a servo just found, and what its registers tell of the time without us."""
         observer = self._observer
         observer.restart(position_known=True)
@@ -327,7 +327,7 @@ class ServoTask:
             self._powering_down = False
 
     async def _power_down_in_turn(self, *, off: bool, leaving: bool) -> None:
-        async with self.turn:
+        async with self.wire_lock:
             device = self._link.device
             await self._come_to_rest(device, off=off, wait=True)
             if off:
@@ -382,7 +382,7 @@ class ServoTask:
             try:
                 if not self._link.is_up:
                     self._link.disconnect()
-                    async with self.turn:
+                    async with self.wire_lock:
                         await self.connect()
                         self.note(Event.FOUND)
                     self._link.happened["reconnects_n"] += 1
@@ -423,7 +423,7 @@ class ServoTask:
         period_s = 1.0 / self._settings.poll_hz
         next_s = loop.time()
         while True:
-            async with self.turn:
+            async with self.wire_lock:
                 await self._cycle(self._link.device)
             next_s = max(next_s + period_s, loop.time())
             if self._link.silence()[1]:
@@ -441,7 +441,7 @@ class ServoTask:
                 finally:
                     timer.cancel()
             self._wake.clear()
-            async with self.turn:
+            async with self.wire_lock:
                 await self._tolerant(self._send_command(self._link.device))
 
     async def _cycle(self, device: Ph54Device) -> None:

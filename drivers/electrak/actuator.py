@@ -349,7 +349,7 @@ class ElectrakActuator:
         age_s = now_s - max(self._track.feedback_at_s, self._opened_at_s)
         if age_s > self.settings.feedback_timeout_s:
             self._track.good_n = 0
-            unknown = self._strangers(now_s)
+            unknown = self._unattached(now_s)
             detail = f"no feedback from address {self.address} for {age_s:.2f} s"
             if unknown and self._link.is_open:
                 heard = ", ".join(str(a) for a in unknown)
@@ -369,9 +369,9 @@ class ElectrakActuator:
         self._faults.keep("thermal_limit", thermal.limited, f"{load}: no motion until it is cooler", now_s)
         self._faults.keep("thermal_derating", thermal.derating and not thermal.limited, f"{load}: rests added", now_s)
 
-    def _strangers(self, now_s: float) -> list[int]:
+    def _unattached(self, now_s: float) -> list[int]:
         """Addresses within an Electrak's reach that give an Electrak's feedback and belong to no configured axis."""
-        return [a for a in self._link.strangers(self.feedback_pgn, now_s) if a in SELECTABLE_ADDRESSES]
+        return [a for a in self._link.unattached(self.feedback_pgn, now_s) if a in SELECTABLE_ADDRESSES]
 
     def _fail(self) -> None:
         if self._lifecycle is not Lifecycle.CLOSED and self._lifecycle is not Lifecycle.FAILED:
@@ -415,7 +415,7 @@ class ElectrakActuator:
 
     def _no_feedback_error(self) -> DeviceError:
         now_s = self._clock.now_s()
-        unknown = self._strangers(now_s)
+        unknown = self._unattached(now_s)
         cause = f"no feedback from address {self.address}"
         remedy = "Check its supply, the 120 ohm terminators and address_n"
         if unknown:

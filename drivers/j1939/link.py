@@ -174,7 +174,7 @@ class CanLink:
         self._address_lost_at_s: float | None = None
         self._users: dict[int, LinkUser] = {}
         self._feedback_pgns: frozenset[int] = frozenset()
-        self._strangers: dict[tuple[int, int], float] = {}
+        self._unattached: dict[tuple[int, int], float] = {}
         self._taps = _Taps()
         self._tasks: list[asyncio.Task[None]] = []
         self._lost = asyncio.Event()
@@ -209,9 +209,9 @@ class CanLink:
         self._health.watch_claim(self._node.claimer, lost_for_s, now_s)
         return self._health.faults(now_s)
 
-    def strangers(self, pgn: int, now_s: float) -> tuple[int, ...]:
+    def unattached(self, pgn: int, now_s: float) -> tuple[int, ...]:
         """Addresses that sent this feedback group within the last second and belong to no attached device."""
-        return tuple(sorted(a for (of_pgn, a), t in self._strangers.items() if of_pgn == pgn and now_s - t < 1.0))
+        return tuple(sorted(a for (of_pgn, a), t in self._unattached.items() if of_pgn == pgn and now_s - t < 1.0))
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -394,7 +394,7 @@ class CanLink:
             if user is not None and user.feedback_pgn == pgn:
                 user.on_feedback(frame.data, now_s)
             else:
-                self._strangers[pgn, source] = now_s
+                self._unattached[pgn, source] = now_s
             return
         if pgn == Pgn.ADDRESS_CLAIMED:
             self._on_claim(frame, now_s)

@@ -25,7 +25,7 @@ QUEUE_N = 16
 """Taken at once in one turn of the event loop; more wait in the kernel."""
 OPEN_N = 64
 SAID_MOST_BYTES = 4096
-PATIENCE_S = 5.0
+TIMEOUT_S = 5.0
 
 
 def stop_socket_beside(path: Path) -> Path:
@@ -72,7 +72,7 @@ class _StopProtocol(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
-        self._timer = asyncio.get_running_loop().call_later(PATIENCE_S, transport.abort)
+        self._timer = asyncio.get_running_loop().call_later(TIMEOUT_S, transport.abort)
         self._open[self] = None
         if len(self._open) > OPEN_N:
             next(iter(self._open)).abort()

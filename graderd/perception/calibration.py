@@ -253,7 +253,7 @@ class _Solver:
         uncertainty = dict(zip((*POSE, *GEOMETRY), map(float, sigma[:9]), strict=True))
         self._judge(residual_mm, residual_px, uncertainty)
         self._compare_with_drawing(blade)
-        self._look_at_empty_bed(calibration, blade)
+        self._check_empty_bed(calibration, blade)
         calibration = calibration.model_copy(
             update={
                 "calibrated_at": when,
@@ -292,7 +292,7 @@ class _Solver:
                     "ground in [attitude]"
                 )
 
-    def _look_at_empty_bed(self, calibration: CameraCalibration, blade: BladeGeometry) -> None:
+    def _check_empty_bed(self, calibration: CameraCalibration, blade: BladeGeometry) -> None:
         """Under what was solved, the bed of these very frames must be empty."""
         settings = PerceptionSettings()
         health = HealthMonitor(settings.health, blade, live=False)

@@ -224,11 +224,11 @@ class SoilClassifier:
         if self._watch is None:
             return []
 
-        def look() -> list[PictureFault]:
+        def judge() -> list[PictureFault]:
             soil = self.height_map(frame, stance)
             return self._seen(soil, stance) if soil is not None else []
 
-        return self._watch.check(look)
+        return self._watch.check(judge)
 
     def _said(self, frame: Frame, verdict: Verdict) -> Verdict:
         if self.color_view(frame) is not None:

@@ -257,9 +257,9 @@ class DepthWatch:
         self._frame_n = 0
         self._faults: list[PictureFault] = []
 
-    def check(self, look: Callable[[], list[PictureFault]]) -> list[PictureFault]:
-        """The faults that the last look found; ``look`` is called only when it is time to."""
+    def check(self, judge: Callable[[], list[PictureFault]]) -> list[PictureFault]:
+        """The faults that it found last; ``judge`` is called only when it is time to."""
         if self._frame_n % CHECK_EVERY_N == 0:
-            self._faults = look()
+            self._faults = judge()
         self._frame_n += 1
         return list(self._faults)

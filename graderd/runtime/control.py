@@ -99,7 +99,7 @@ class ControlLoop:
         self._queue: deque[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = deque()
         self._refused: dict[str, str] = {}
         self._keep_last_stop = False
-        self.sensed = self._sense(())
+        self.sensed = self._sensed(())
         self.tick = self._controller.step(self.sensed)
 
     # ---- commands -------------------------------------------------------------------------------------------------
@@ -141,14 +141,14 @@ class ControlLoop:
             while True:
                 late_s = max(0.0, self._clock.now_s() - due_s)
                 self.lateness_s.append(late_s)
-                self.turn(late_s)
+                self.run_tick(late_s)
                 due_s = max(due_s + self._period_s, self._clock.now_s())
                 await asyncio.sleep(max(0.0, due_s - self._clock.now_s()))
         finally:
             await self._power.close()
 
-    def turn(self, late_s: float = 0.0) -> None:
-        """One turn of sense, decide, act, with the commands that came meanwhile."""
+    def run_tick(self, late_s: float = 0.0) -> None:
+        """Sense, decide, act, with the commands that came meanwhile."""
         queued = [self._queue.popleft() for _ in range(min(len(self._queue), MAX_COMMANDS_PER_TICK))]
         replies = self._step(tuple(command for command, _ in queued), late_s)
         for (_, future), reply in zip(queued, replies, strict=True):
@@ -159,7 +159,7 @@ class ControlLoop:
 
     def _step(self, commands: tuple[cmd.Command, ...], late_s: float = 0.0) -> tuple[cmd.Reply, ...]:
         before = self.tick.state
-        self.sensed = self._sense(commands, late_s)
+        self.sensed = self._sensed(commands, late_s)
         self.tick = self._controller.step(self.sensed)
         self._act(self.tick)  # the wires come first, then whoever wants to know
         self._note(before.mode, self.tick.state)
@@ -182,7 +182,7 @@ class ControlLoop:
         fields = {"event": True, "mode": after.mode, "client": client, "fault": fault}
         log.info("%s -> %s: %s", before, after.mode, after.reason, extra=fields)
 
-    def _sense(self, commands: tuple[cmd.Command, ...], late_s: float = 0.0) -> Sensed:
+    def _sensed(self, commands: tuple[cmd.Command, ...], late_s: float = 0.0) -> Sensed:
         """Everything that is known now; each device is asked once."""
         now_s = self._clock.now_s()
         found: list[DeviceFault] = [*self._devices.link.faults(), *self._eyes.faults()]

@@ -13,7 +13,7 @@ from pathlib import Path
 from graderd.config import Config
 from graderd.hal.fault import DeviceFault, PresentFaults
 
-LOOK_EVERY_S = 1.0
+MEASURE_EVERY_S = 1.0
 STEP_S = 2.0
 STEP_SHOWN_S = 10.0
 
@@ -27,12 +27,12 @@ class HealthWatch:
         self._faults = PresentFaults("daemon")
 
     async def run(self) -> None:
-        """Look once a second until cancelled."""
+        """Measure once a second until cancelled."""
         while True:
-            self.look()
-            await asyncio.sleep(LOOK_EVERY_S)
+            self.measure()
+            await asyncio.sleep(MEASURE_EVERY_S)
 
-    def look(self) -> None:
+    def measure(self) -> None:
         """Take one measurement."""
         now_s = time.monotonic()
         offset_s = time.time() - now_s

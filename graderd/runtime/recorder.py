@@ -64,7 +64,7 @@ class Recorder:
         if self._settings.directory and now_s >= self._due_s:
             self._due_s = now_s + 1.0 / self._settings.rate_hz
             taken = status()
-            incident = self._incidents.look(taken)
+            incident = self._incidents.seen_in(taken)
             self._queue.append((taken.model_dump_json(exclude={"readiness", "presets"}), incident))
 
     def expect_stop(self) -> None:
@@ -178,8 +178,8 @@ class IncidentWatch:
         """The next stop is none."""
         self._mode = Mode.STOPPED
 
-    def look(self, status: Status) -> bool:
-        """Whether it has come with this status."""
+    def seen_in(self, status: Status) -> bool:
+        """Whether one has come with this status."""
         faults = frozenset(f.name for f in status.faults if f.reaction != Reaction.WARN.name.lower())
         stopped = status.mode is Mode.STOPPED and self._mode is not Mode.STOPPED
         disturbed = self._mode in ARMED and bool(faults - self._faults)

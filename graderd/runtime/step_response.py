@@ -279,7 +279,7 @@ def _plot(samples: Sequence[StepSample], label: str, curves: Sequence[_Curve]) -
         for time_s in times_s
     ]
     for i, curve in enumerate(curves):
-        look = f'stroke="var(--{curve.name})" stroke-width="1.8"' + (' stroke-dasharray="6 4"' if curve.jumps else "")
+        style = f'stroke="var(--{curve.name})" stroke-width="1.8"' + (' stroke-dasharray="6 4"' if curve.jumps else "")
         path, former_y = [], y(curve.value(samples[0]))
         for s in samples:
             here_x, here_y = x(s.time_s - start_s), y(curve.value(s))
@@ -287,9 +287,9 @@ def _plot(samples: Sequence[StepSample], label: str, curves: Sequence[_Curve]) -
                 path.append(f"{here_x:.1f},{former_y:.2f}")
             path.append(f"{here_x:.1f},{here_y:.2f}")
             former_y = here_y
-        drawn.append(f'<polyline fill="none" {look} points="{" ".join(path)}"/>')
+        drawn.append(f'<polyline fill="none" {style} points="{" ".join(path)}"/>')
         left = _LEFT + 110 * i
-        drawn.append(f'<line x1="{left}" x2="{left + 24}" y1="10" y2="10" {look}/>')
+        drawn.append(f'<line x1="{left}" x2="{left + 24}" y1="10" y2="10" {style}/>')
         drawn.append(f'<text x="{left + 30}" y="14">{escape(curve.name)}</text>')
     return (
         f'<h2>{escape(label)}</h2><div class=wide><svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '

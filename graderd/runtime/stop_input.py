@@ -85,7 +85,7 @@ class StopInputWatch:
             try:
                 self._source.open()
                 log.info("stop input: %s", self._source.where, extra={"device": DEVICE})
-                self._look_on(loop)
+                self._read_loop(loop)
             except DeviceError as error:
                 # At every attempt: the log repeats it ever more rarely.
                 log.warning("stop input: %s", error, extra={"device": DEVICE, "fault": f"{DEVICE}.lost"})
@@ -93,7 +93,7 @@ class StopInputWatch:
                 self._ending.wait(RETRY_S)
         self._source.close()
 
-    def _look_on(self, loop: asyncio.AbstractEventLoop) -> None:
+    def _read_loop(self, loop: asyncio.AbstractEventLoop) -> None:
         """Read, and now and then test, until told to end or until the port is lost."""
         settings = self._settings
         opens_n, stuck = 0, False

@@ -120,8 +120,8 @@ class CameraProcess:
 
     def change(self, message: dict[str, Any]) -> None:
         """A change that the rig asks for: ``look``, ``fault`` with ``params``, or ``clear``."""
-        if "look" in message:
-            self._appearance = Appearance(**message["look"])
+        if "appearance" in message:
+            self._appearance = Appearance(**message["appearance"])
         if "fault" in message:
             self._faults = {**self._faults, message["fault"]: message["params"]}
         if message.get("clear"):

@@ -330,11 +330,11 @@ class VirtualServoBus:
         """Look out for the next request without going to sleep, so that our own waking up is not part of it."""
         heard = bytearray()
 
-        def look() -> bool:
+        def came() -> bool:
             heard.extend(self._take())
             return bool(heard)
 
-        if busy_until(self._clock, self._clock.now_s() + self._linger_s, look):
+        if busy_until(self._clock, self._clock.now_s() + self._linger_s, came):
             asyncio.get_running_loop().call_soon(self._receive, bytes(heard))
 
     def _put(self, data: bytes) -> None:
@@ -374,10 +374,10 @@ def baud_of(fd: int) -> int:
     return int(words[-1])
 
 
-def busy_until(clock: Clock, at_s: float, look: Callable[[], bool] = bool) -> bool:
-    """Spin until ``at_s``, or until ``look()`` is true; for waits shorter than a timer can do. Returns ``look()``."""
+def busy_until(clock: Clock, at_s: float, ready: Callable[[], bool] = bool) -> bool:
+    """Spin until ``at_s``, or until ``ready()`` is true; for waits shorter than a timer can do. Returns ``ready()``."""
     while clock.now_s() < at_s:
-        if look():
+        if ready():
             return True
     return False
 

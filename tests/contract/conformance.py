@@ -41,7 +41,7 @@ from graderd.hal.reading import Reading
 from graderd.hal.rotator import Rotator
 from graderd.hal.stop_input import StopInput
 
-PATIENCE_S = 15.0
+TIMEOUT_S = 15.0
 """Deadline of waits: long, because the machine may be busy; nothing is measured by it."""
 RENEW_S = 0.02
 FRESH_S = 0.4
@@ -106,14 +106,14 @@ class AxisStand(ABC):
 
     async def until(self, met: Callable[[], object]) -> None:
         """Let time pass until something is so."""
-        until_s = self.clock.now_s() + PATIENCE_S
+        until_s = self.clock.now_s() + TIMEOUT_S
         while not met():
             assert self.clock.now_s() < until_s, f"{self.device.lifecycle}, {self.device.faults()}"
             await self.wait(RENEW_S)
 
     async def drive(self, goal: float, met: Callable[[], object]) -> None:
         """Renew a goal as the control tick does, until something is so."""
-        until_s = self.clock.now_s() + PATIENCE_S
+        until_s = self.clock.now_s() + TIMEOUT_S
         while not met():
             assert self.clock.now_s() < until_s, f"{self.device.lifecycle}, {self.device.faults()}"
             self.set_goal(goal)
@@ -397,19 +397,19 @@ class CameraConformance:
     def test_it_can_be_closed_twice_and_opened_again(self, camera_stand: CameraStand) -> None:
         camera = camera_stand.camera
         camera.open()
-        camera.read(PATIENCE_S)
+        camera.read(TIMEOUT_S)
         camera.close()
         camera.close()
         with pytest.raises(LifecycleError):
             camera.read(0.1)
         camera.open()
-        assert camera.read(PATIENCE_S).color_bgr.size
+        assert camera.read(TIMEOUT_S).color_bgr.size
 
     def test_a_source_that_goes_is_told(self, camera_stand: CameraStand) -> None:
         """A live one says so; a file that was read holds out to its end."""
         camera = camera_stand.camera
         camera.open()
-        camera.read(PATIENCE_S)
+        camera.read(TIMEOUT_S)
         camera_stand.lose()
 
         def read_on() -> None:
@@ -432,7 +432,7 @@ class CameraConformance:
         frames: list[Frame] = []
         try:
             while len(frames) < 5:
-                frames.append(camera.read(PATIENCE_S))
+                frames.append(camera.read(TIMEOUT_S))
         except EndOfFrames:
             pass
         return frames

@@ -63,7 +63,7 @@ class Grader:
     async def tick(self) -> None:
         self.machine.clock.advance(TICK_S)
         before_s = self.loop.tick.state.decision.decided_s
-        self.loop.turn()
+        self.loop.run_tick()
         await asyncio.sleep(0)
         decision = self.loop.tick.state.decision
         if decision.decided_s != before_s and decision.zone is not None:

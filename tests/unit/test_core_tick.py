@@ -225,7 +225,7 @@ async def test_a_stop_makes_void_what_was_asked_before_it(tmp_path: Path) -> Non
     assert first.accepted
     assert second.accepted
     assert not (await asked).accepted
-    loop.turn()
+    loop.run_tick()
     assert loop.tick.state.mode is Mode.STOPPED
     assert loop.tick.state.reason == "dog (by a); also: child (by c)"
     await loop._power.close()
@@ -247,7 +247,7 @@ async def test_each_device_is_asked_once_a_tick_and_readiness_is_made_once(
     for name, device in machine.devices.all().items():
         monkeypatch.setattr(device, "telemetry", count(name, device.telemetry))
     monkeypatch.setattr("graderd.core.tick.requirements", count("requirements", readiness.requirements))
-    loop.turn()
+    loop.run_tick()
     assert asked == Counter({**dict.fromkeys(AXES, 1), "requirements": 1})
     await loop._power.close()
 

@@ -59,7 +59,7 @@ class Monitor:
         self.moves_n = dict.fromkeys(AXES, 0)
         self.decided_n = 0
 
-    def look(self, sensed: Sensed, tick: Tick) -> None:
+    def judge(self, sensed: Sensed, tick: Tick) -> None:
         dt_s = 0.0 if self.last_s is None else sensed.now_s - self.last_s
         self.last_s = sensed.now_s
         measured = {axis: fresh(sensed, axis) for axis in AXES}
@@ -375,7 +375,7 @@ def run(seed: int, ticks_n: int, monitor: Monitor) -> None:
         sensed = world.sense(tick)
         tick = controller.step(sensed)
         try:
-            monitor.look(sensed, tick)
+            monitor.judge(sensed, tick)
         except AssertionError as error:
             raise AssertionError(f"seed {seed}, tick {number}: {error}") from error
 
@@ -399,7 +399,7 @@ def _first_motion() -> tuple[Sensed, Tick, Monitor]:
         before = copy.deepcopy(monitor)
         sensed = world.sense(tick)
         tick = controller.step(sensed)
-        monitor.look(sensed, tick)
+        monitor.judge(sensed, tick)
         if tick.axes["rotation"].send is not None and before.lease is not None and not sensed.commands:
             return sensed, tick, before
     raise AssertionError("the rotation never moved")
@@ -421,7 +421,7 @@ def test_the_monitor_sees_what_it_is_for(wrong: dict[str, object], said: str) ->
     for name, value in wrong.items():
         setattr(monitor, name, value)
     with pytest.raises(AssertionError, match=said):
-        monitor.look(sensed, tick)
+        monitor.judge(sensed, tick)
 
 
 def test_the_monitor_sees_a_goal_led_too_far() -> None:
@@ -431,4 +431,4 @@ def test_the_monitor_sees_a_goal_led_too_far() -> None:
     for offset, said in ((30.0, "led too far"),):
         changed = replace(tick, axes={**tick.axes, "rotation": replace(axis, send=axis.send + offset)})
         with pytest.raises(AssertionError, match=said):
-            copy.deepcopy(monitor).look(sensed, changed)
+            copy.deepcopy(monitor).judge(sensed, changed)

@@ -41,7 +41,7 @@ class Bench:
             if zone is not None and index % 3 == 0:
                 now_s = self.machine.clock.now_s()
                 self.machine.eyes.next = SoilObservation(now_s, zone, 0.9, "", **shares)
-            self.loop.turn()
+            self.loop.run_tick()
             for _ in range(4):
                 await asyncio.sleep(0)  # the power keeper's task takes its turns
 
@@ -160,7 +160,7 @@ async def test_after_a_freeze_the_reason_is_the_freeze(bench: Bench) -> None:
     await bench.arm()
     bench.machine.clock.advance(1.5)
     bench.machine.rotation.lose()
-    bench.loop.turn(late_s=1.5)
+    bench.loop.run_tick(late_s=1.5)
     assert bench.loop.tick.state.mode is Mode.DISARMED
     assert bench.loop.tick.state.reason.startswith("daemon.loop_blocked: ")
     assert {"daemon.loop_blocked", "rotation.no_reply"} <= {fault.name for fault in bench.loop.tick.faults}
@@ -434,7 +434,7 @@ async def test_a_stuck_lift_is_disarmed(bench: Bench) -> None:
 
 async def test_a_late_tick_is_told_for_a_second_and_a_long_one_beside_it(bench: Bench) -> None:
     for late_s in (0.7, 0.15):
-        bench.loop.turn(late_s)
+        bench.loop.run_tick(late_s)
     await bench.ticks(2)
     assert {f.name for f in bench.loop.tick.faults} == {"daemon.loop_blocked", "daemon.tick_overrun"}
     await bench.ticks(50)

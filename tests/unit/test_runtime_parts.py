@@ -259,11 +259,11 @@ def test_without_a_directory_nothing_is_recorded() -> None:
 
 def test_a_stepped_clock_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     watch = HealthWatch(Config())
-    watch.look()
+    watch.measure()
     assert watch.faults(time.monotonic()) == ()
     real = time.time
     monkeypatch.setattr(time, "time", lambda: real() + 3600.0)
-    watch.look()
+    watch.measure()
     (fault,) = watch.faults(time.monotonic())
     assert fault.condition == "clock_stepped"
     assert "+3600 s" in fault.detail
@@ -272,7 +272,7 @@ def test_a_stepped_clock_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_high_memory_is_told() -> None:
     watch = HealthWatch(parse({"control": {"memory_warn_mb": 1.0}}))
-    watch.look()
+    watch.measure()
     assert [fault.condition for fault in watch.faults(time.monotonic())] == ["memory_high"]
 
 

@@ -28,7 +28,7 @@ from dynamixel_sdk import (
 )
 from rustypot import Xl430PyController
 
-from tests.dynamixel_sim import PATIENCE_S, ServoProcess, servo_process
+from tests.dynamixel_sim import TIMEOUT_S, ServoProcess, servo_process
 
 pytestmark = pytest.mark.serial_only  # the SDK gives up after 34 ms, whatever the machine is busy with
 IDS = (1, 3, 7)
@@ -44,7 +44,7 @@ def servos(tmp_path: Path) -> Iterator[ServoProcess]:
 
 def patiently(call: Callable[[], T], good: Callable[[T], object], what: str) -> T:
     """Call again while a client with a short built-in timeout gives up on a busy machine."""
-    until_s = time.monotonic() + PATIENCE_S
+    until_s = time.monotonic() + TIMEOUT_S
     while True:
         result = call()
         if good(result):
@@ -178,7 +178,7 @@ class Patient:
 
     def __getattr__(self, name: str) -> Any:
         def call(*arguments: Any) -> Any:
-            until_s = time.monotonic() + PATIENCE_S
+            until_s = time.monotonic() + TIMEOUT_S
             while True:
                 try:
                     result = getattr(self._inner, name)(*arguments)
