@@ -72,6 +72,7 @@ class FakeDaemon:
     bus_watched_n: int = 0
     maneuvers: list[str] = field(default_factory=list)
     state: State = field(default_factory=State)
+    torque_on: bool | None = None
     positions: dict[str, float] = field(
         default_factory=lambda: {"rotation": 0.0, "lift_left": 100.0, "lift_right": 100.0, "tilt": 50.0}
     )
@@ -258,6 +259,7 @@ class FakeDaemon:
                 measured_age_s=0.01,
                 moving=name in self._moving,
                 in_position=name not in self._moving,
+                torque_on=self.torque_on if name == "rotation" else None,
             )
             for name, position in self.positions.items()
         }

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from graderd import places
-from graderd.cli import calibrate_lifts
-from graderd.cli.console import CliError, ExitCode, Json, client_of, example, plain_table, print_json, print_text
+from graderd.cli import calibrate_lifts, calibrate_rotation
+from graderd.cli.console import CliError, ExitCode, Json, agree, client_of, example, plain_table, print_json, print_text
 from graderd.hal.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def register(app: typer.Typer) -> None:
         """Find out how this machine differs from the drawing, and write it down."""
 
     calibrate_lifts.register(group)
+    calibrate_rotation.register(group)
 
     @group.command(
         epilog=example(
@@ -83,9 +84,9 @@ def register(app: typer.Typer) -> None:
         if json and not yes:
             raise CliError("calibrate", "--json cannot ask", "Add --yes to consent", ExitCode.USAGE)
         path = config or places.CONFIG
-        settings = _load(path, must_exist=config is not None)
+        settings = load_config(path, must_exist=config is not None)
         start_pose = _pose(pose)
-        _may_write(path)
+        may_write(path)
         if source is None and start_pose is not None and not live:
             _by_hand(path, settings, start_pose, yes, json)
             return
@@ -103,7 +104,12 @@ def register(app: typer.Typer) -> None:
         _done(path, backup, json)
 
 
-def _load(path: Path, must_exist: bool) -> Config:
+def load_config(path: Path, must_exist: bool) -> Config:
+    """The configuration to change; a new one's defaults where it may be new.
+
+    Raises:
+        CliError: it is not valid.
+    """
     from graderd.config.loader import ConfigError, load
     from graderd.config.models import Config as Model
 
@@ -267,14 +273,8 @@ def _changes(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _agree(question: str, yes: bool) -> None:
-    if yes:
-        return
-    try:
-        agreed = typer.confirm(question, default=False)
-    except typer.Abort:
-        agreed = False
-    if not agreed:
-        raise CliError("calibrate", "cancelled; nothing was changed", "Add --yes to consent beforehand")
+    if not yes:
+        agree("calibrate", question, "Add --yes to consent beforehand")
 
 
 def write_calibration(path: Path, changes: dict[str, Any]) -> Path | None:
@@ -292,7 +292,7 @@ def write_calibration(path: Path, changes: dict[str, Any]) -> Path | None:
         raise CliError("", error.problems[0]) from None
 
 
-def _may_write(path: Path) -> None:
+def may_write(path: Path) -> None:
     """Learn now what would keep the result from being written: before the blade turns, and before the person waits."""
     from graderd.config.loader import ConfigError
     from graderd.config.rewrite import check_rights

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from graderd import places
-from graderd.cli.console import CliError, ExitCode, client_of, example, print_text
+from graderd.cli.console import CliError, ExitCode, agree, client_of, example, print_text
 from graderd.cli.move import move
 from graderd.client import Client
 from graderd.core.axes import LIFTS
@@ -45,7 +45,10 @@ def register(group: typer.Typer) -> None:
         backup. The exit status is 1 where they are swapped or did not move.
         """
         client = client_of(context)
-        _agree(f"The left end of the blade will rise, the right one sink, by {by_deg:g} deg together. Is it clear?")
+        agree(
+            "lifts",
+            f"The left end of the blade will rise, the right one sink, by {by_deg:g} deg together. Is it clear?",
+        )
         _tilt(client, by_deg)
         try:
             seen = _ask()
@@ -88,17 +91,8 @@ def _exchange(client: Client, config: Path | None) -> None:
     if left_n is None or right_n is None:
         raise CliError("lifts", "left and right are swapped", "Exchange them in the settings of their driver")
     print_text(f"Left and right are swapped: the left one is at address {right_n}, the right one at {left_n}")
-    _agree(f"Write this into {path}?")
+    agree("lifts", f"Write this into {path}?")
     changes = {"lift_left": {"address_n": right_n}, "lift_right": {"address_n": left_n}}
     backup = write_calibration(path, changes)
     kept = f"; the former file is {backup}" if backup else ""
     print_text(f"written to {path}{kept}\nrestart the daemon, then do this again")
-
-
-def _agree(question: str) -> None:
-    try:
-        agreed = typer.confirm(question, default=False)
-    except typer.Abort:
-        agreed = False
-    if not agreed:
-        raise CliError("lifts", "cancelled; nothing was changed", "Do it again when the blade is clear")
