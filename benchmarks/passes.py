@@ -211,8 +211,14 @@ async def in_processes(asked: list[Case]) -> list[Outcome]:
     outcomes = []
     async with stack() as machine:
         for case in asked:
-            for _ in range(DRIVEN_N):
-                outcome = show(await machine.drive_pass(case))
+            for left in reversed(range(DRIVEN_N)):
+                try:
+                    outcome = show(await machine.drive_pass(case))
+                except (RuntimeError, TimeoutError) as error:  # a fault ended it before it began
+                    print(f"{case}: {error or 'timed out'}", file=sys.stderr, flush=True)
+                    if left:
+                        continue
+                    raise
                 if not outcome.note:
                     break
             outcomes.append(outcome)

@@ -216,9 +216,12 @@ def loop_pass(case: Case, config: Config, materials: Materials) -> Outcome:
     started_s, drove = one.now_s, False
     vehicle = one.world.vehicle
     start_x_m = vehicle.x_m
+    note = ""
     for tick in one.ticks():
         decision = tick.state.decision
         heard.hear(decision.zone, drove)
+        if drove and tick.state.mode is not Mode.AUTO:
+            note = note or f"{tick.state.mode}: {tick.state.reason}"
         if not drove and tick.state.mode is Mode.AUTO:
             turned = decision.angle_deg is not None and abs(one.angle_deg - decision.angle_deg) < SETTLED_DEG
             if case.at_once or turned or one.now_s - started_s > UNDECIDED_S:
@@ -228,7 +231,7 @@ def loop_pass(case: Case, config: Config, materials: Materials) -> Outcome:
             break
     field = one.world.field
     width = width_left_behind_mm(field.heights_m, field.cell_m, start_x_m, vehicle.x_m - BEHIND_M)
-    return Outcome(case, tuple(heard.zones), heard.changes_n, width, one.angle_deg)
+    return Outcome(case, tuple(heard.zones), heard.changes_n, width, one.angle_deg, note)
 
 
 def fixed_width_mm(seed: int, speed_m_per_s: float) -> float:

@@ -35,15 +35,16 @@ SLOPE_NOISE_RATIO = 2.0
 """Noise along the line of sight lifts points of a slope that faces the camera twice as much as those of ground."""
 CELL_M = 0.04
 """Ground plan of the columns in which something standing is looked for."""
-LEVEL_M = 0.04
-"""Their levels: soil at 60 degrees crosses three of them within a column's diagonal, a leg all."""
-LEVELS_N = 4
+LEVEL_M = 0.02
+"""Their levels: between a full blade's heap and the machine's arms above it one at least stays empty."""
+LEVELS_N = 8
+"""So many in a row without a gap: soil at 60 degrees crosses six of them within a column's diagonal, a leg all."""
 LEVEL_POINTS_N = 2
 """Points in a level: a single one may be a wrong match."""
 LOWEST_M = 0.04
-LOW_STARTS_N = 3
+LOW_STARTS_N = 6
 """It must begin below 16 cm, or on soil beside it: what hangs from above (hoses, the machine's arms) does not stand."""
-ON_SOIL_STARTS_N = 4
+ON_SOIL_STARTS_N = 8
 """On soil too it begins below 20 cm: higher, the machine's arms touch a heap that fills the blade."""
 BESIDE_COLUMNS_N = 2
 HIGHEST_M = 0.52
@@ -149,7 +150,7 @@ def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[flo
     found = [
         at
         for at in np.argwhere(upright)
-        if starts[*at] < LOW_STARTS_N or starts[*at] <= min(_level(soil, upright, at) + 1, ON_SOIL_STARTS_N - 1)
+        if starts[*at] < LOW_STARTS_N or starts[*at] <= min(_level(soil, upright, at) + 2, ON_SOIL_STARTS_N - 1)
     ]
     if len(found) < STANDING_COLUMNS_N:
         return None

@@ -25,6 +25,14 @@ FACE_BAND_M = 0.16
 """The face is looked for from its upper edge down to here."""
 PLACE_M = 0.01
 LEVEL_M = 0.015
+ON_FACE_M = 0.015
+"""Points so near to the face lie on it."""
+BEHIND_VOTES = 2.0
+"""What is seen behind a face speaks against it by so many columns: nothing is seen through the blade."""
+TURN_VOTES = 15.0
+"""A face turned against the measured angle by 4 degrees needs one column more."""
+APART_COLUMNS_N = 3
+"""The face's direction is taken from columns so far apart at least."""
 ABOVE_PX = np.arange(1, 7)
 """Steps above the upper edge in which nothing may stand nearer, and what lies behind must show."""
 UPRIGHT_LEVELS_N = 4
@@ -262,11 +270,8 @@ class BladeFinder:
         s_at = (np.flatnonzero(upright) + 0.5) / self.COLUMNS_N * blade.length_m - half
         if s_at.size < self.COLUMNS_N // 3:
             return BladeFix()
-        first, second = np.triu_indices(s_at.size, 3)
-        slopes = (face_at[second] - face_at[first]) / (s_at[second] - s_at[first])
-        slope = middle(slopes) if slopes.size else 0.0
-        ahead = middle(face_at - slope * s_at)
-        on_face = np.abs(near_face - np.float32(ahead) - np.float32(slope) * near_s) < 0.015
+        ahead, slope = _line_of_most(s_at, face_at)
+        on_face = np.abs(near_face - np.float32(ahead) - np.float32(slope) * near_s) < ON_FACE_M
         along = self._ends(near_s[on_face])
         return BladeFix(ahead, along, -float(np.degrees(np.arctan(slope))), float(on_face.mean()), 0.0)
 
@@ -306,6 +311,24 @@ class BladeFinder:
 
 def _cos_sin(angle_deg: float) -> tuple[np.float32, np.float32]:
     return np.float32(math.cos(math.radians(angle_deg))), np.float32(math.sin(math.radians(angle_deg)))
+
+
+def _line_of_most(s: F64, face: F64) -> tuple[float, float]:
+    """Place at s = 0 and slope of the line on which most of the places lie, and the rearmost of such lines.
+
+    The flank of a heap stands as upright as the face in a column or two, ahead of it; nothing stands behind it.
+    """
+    first, second = np.triu_indices(s.size, APART_COLUMNS_N)
+    slope = (face[second] - face[first]) / (s[second] - s[first])
+    at_0 = face[first] - slope * s[first]
+    off = face - at_0[:, None] - slope[:, None] * s
+    on_line = np.abs(off) < ON_FACE_M
+    score = on_line.sum(axis=1) - BEHIND_VOTES * (off <= -ON_FACE_M).sum(axis=1) - np.abs(slope) * TURN_VOTES
+    best = int(np.argmax(score - at_0))
+    s, face = s[on_line[best]], face[on_line[best]]
+    s_mean, face_mean = s.mean(), face.mean()
+    fitted = float((s - s_mean) @ (face - face_mean) / ((s - s_mean) @ (s - s_mean)))
+    return float(face_mean - fitted * s_mean), fitted
 
 
 def _median_slope(s: F64, z: F64) -> float:

@@ -79,6 +79,8 @@ def test_what_stands_is_told_from_what_hangs_and_from_a_slope() -> None:
     assert found is not None
     assert found == pytest.approx((0.13, 0.2), abs=0.03)
     assert standing(*column(up[up > 0.22]), 0.5, 0.6) is None  # an arm of the machine
+    over_heap = column(up[((up > 0.10) & (up < 0.23)) | (up > 0.265)])  # an arm 4 cm over a full blade's heap
+    assert standing(*over_heap, 0.5, 0.6) is None
     s, d, z = column(up)
     assert standing(s, np.float32(0.1) + z, z, 0.5, 0.6) is None  # soil, and steep soil
     assert standing(s + np.float32(0.6), d, z, 0.5, 0.6) is None  # beside the blade
