@@ -153,7 +153,7 @@ def step(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSett
     return Step(
         state,
         Intents(
-            goals=_unheld(state.goals, held_axes(_counting(state, inputs))) if armed else Goals(),
+            goals=state.goals if armed else Goals(),
             power=armed or state.arming_since_s is not None,
             stop=state.mode is Mode.STOPPED,
         ),
@@ -335,12 +335,7 @@ def _counting(state: State, inputs: Inputs) -> list[ActiveFault]:
 
 def _held(state: State, inputs: Inputs) -> dict[str, str]:
     """Why an axis must stay where it is: a fault that holds it, or the gate that did not let its goal pass."""
-    by_part = {
-        part: f"{fault.name}: {fault.row.reads}"
-        for fault in reversed(_counting(state, inputs))  # the worst one last, so that it is the one told
-        if fault.row.reaction >= Reaction.HOLD
-        for part in fault.row.axes
-    }
+    by_part = {part: f"{f.name}: {f.row.reads}" for part, f in held_axes(_counting(state, inputs)).items()}
     return dict(inputs.held) | {axis: by_part[part] for axis, part in PARTS.items() if part in by_part}
 
 
@@ -353,11 +348,6 @@ def _why_holding(state: State, inputs: Inputs) -> tuple[str, ...]:
     if state.mode is Mode.AUTO and state.decision.zone is None and not reasons:
         reasons.append("no decision yet: the camera has not shown soil clearly enough")
     return tuple(reasons)
-
-
-def _unheld(goals: Goals, held: frozenset[str]) -> Goals:
-    """Goals without those of the axes that must stay."""
-    return Goals.of(**{axis: None if PARTS[axis] in held else goal for axis, goal in goals.items()})
 
 
 def _stopped(state: State, reason: str) -> State:

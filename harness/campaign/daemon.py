@@ -22,10 +22,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from graderd.core import machine
+from graderd.core import machine, tick
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import Clear, FaultRow, Reaction
-from graderd.runtime import control
 from graderd.runtime.app import daemon as product
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 
@@ -33,7 +32,7 @@ WORKER = "harness.campaign.worker"
 
 
 def _replace_catalogue(rows: Mapping[str, FaultRow]) -> None:
-    vars(control)["CATALOGUE"] = rows
+    vars(tick)["CATALOGUE"] = rows
 
 
 def _only_warn(key: str) -> None:
@@ -41,7 +40,7 @@ def _only_warn(key: str) -> None:
 
 
 def _hold_nothing() -> None:
-    vars(machine)["held_axes"] = lambda _: frozenset()
+    vars(machine)["held_axes"] = lambda _: {}
 
 
 def _forget_latches() -> None:

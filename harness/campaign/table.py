@@ -5,14 +5,15 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import time
 from contextlib import suppress
 from typing import Any
 
 from graderd.hal.errors import DeviceError
 from graderd.simulator.grader.blade import LEVEL_TILT_MM
-from harness.campaign.conduct import goes_up
-from harness.campaign.model import ROTATION, Action, Case, Phase
-from harness.campaign.stack import Stack
+from harness.campaign.conduct import BRAKE_S, EVERYTHING, SLACK_S, STILL_S, goes_up, names_in
+from harness.campaign.model import ROTATION, Action, Case, Outcome, Phase
+from harness.campaign.stack import CampaignError, Stack
 
 TILT_REACH_MM = 40.0
 """From level, either way: inside what a new start is permitted at."""
@@ -108,6 +109,37 @@ async def put_back(stack: Stack) -> None:
     await reboot(stack)
 
 
+async def by_depth_alone(stack: Stack, case: Case, phase: Phase, outcome: Outcome) -> None:
+    """Depth brings its own light: without a colour picture the soil is seen as before, and the work goes on."""
+    before = outcome.expected_state = "auto" if phase is TURNING else "manual"
+    from_s = time.monotonic()
+    await case.inject(stack)
+    await asyncio.sleep(0.5)  # until the last picture with colour is no longer the newest
+    with suppress(CampaignError):
+        await stack.until_status(lambda s: s["soil"]["zone"] != "unknown", 6.0, "the soil is unknown")
+        outcome.detected, outcome.detection_s = True, time.monotonic() - from_s
+    soil = stack.status["soil"]
+    outcome.message = f"nothing to tell: by depth the soil is {soil['zone']}, {soil['confidence']:.0%} sure"
+    if phase is TURNING:
+        goal_deg = stack.status["decision"]["angle_deg"]
+        if goal_deg is None:
+            raise CampaignError(f"the decision is gone: {stack.status['mode']}, {stack.status['reason']}")
+        there = f"the blade does not come to {goal_deg}°"
+        await stack.until(lambda: abs(stack.watch.newest().state["blade_deg"] - goal_deg) < 1.0, 6.0, there)
+    status = await stack.read_status() or {}
+    outcome.problems += [f"told {name}" for name in names_in(status) if name.startswith("camera.")]
+    outcome.final_state = str(status.get("mode", "no answer"))
+    if outcome.final_state != before:
+        outcome.problems.append(f"the mode became {outcome.final_state}: {status.get('reason')}")
+    await stack.rest()
+    released_s = time.monotonic()
+    await stack.command("manual")
+    outcome.safe = await stack.watch.until_still(EVERYTHING, STILL_S, 3.0)
+    outcome.standstill_s, outcome.standstill_from = stack.watch.standstill_s(EVERYTHING, released_s), "manual command"
+    outcome.safe = outcome.safe and outcome.standstill_s <= BRAKE_S + SLACK_S
+    outcome.recovered_as_catalogued, outcome.recovery = True, "nothing to recover from"
+
+
 def on_bare_ground(inject: Action) -> Action:
     """Without soil: a blade that spins through a heap costs the rig more time than its wires have."""
 
@@ -119,7 +151,7 @@ def on_bare_ground(inject: Action) -> Action:
 
 
 def _camera(name: str, text: str, fault: str, inject: Action, **more: Any) -> Case:
-    return Case(f"camera_{name}", text, (f"camera.{fault}",), inject, heal, **more)
+    return Case(f"camera_{name}", text, (f"camera.{fault}",) if fault else (), inject, heal, **more)
 
 
 def _servo(name: str, text: str, faults: str, inject: Action, **more: Any) -> Case:
@@ -141,9 +173,10 @@ CAMERA = (
     _camera("unplug", "the camera is gone", "missing", camera("unplug"), detect_s=1.0, short=(TURNING,)),
     _camera("stall", "no further frame, the connection stays", "stale", camera("stall"), detect_s=0.8),
     _camera("freeze", "the same picture under new numbers", "frozen", camera("freeze"), detect_s=1.5),
-    _camera("black", "no light", "black", camera("black"), detect_s=0.8, short=(TURNING, LIFTING)),
-    _camera("blown_out", "overexposed", "blown_out", camera("blown_out"), detect_s=0.8),
-    _camera("blocked", "something covers both lenses", "blocked", camera("blocked"), detect_s=0.8),
+    _camera("black", "no light in the colour picture", "", camera("black"), conduct=by_depth_alone, short=(TURNING,)),
+    _camera("blown_out", "the colour picture overexposed", "", camera("blown_out"), conduct=by_depth_alone),
+    _camera("blocked", "something covers both lenses", "blocked", camera("blocked"), detect_s=0.8,
+            short=(TURNING, LIFTING)),
     _camera("blurred", "out of focus", "blurred", camera("blurred"), detect_s=2.0),
     _camera("torn", "depth from an earlier frame than colour", "torn", camera("torn"), detect_s=1.2),
     _camera("knocked", "the mount was hit", "knocked", camera("knocked"), detect_s=3.0),

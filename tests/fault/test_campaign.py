@@ -86,7 +86,7 @@ async def test_the_shortened_campaign_passes() -> None:
     ("broken", "fault", "phase", "told"),
     [
         ("camera_missing_only_warns", "camera_unplug", "turning", "the catalogue says manual"),
-        ("held_axes_go_on", "camera_black", "turning", "went on for"),
+        ("held_axes_go_on", "camera_stall", "turning", "went on for"),
         ("latches_let_go", "servo_torque_off", "idle", "went away by itself"),
     ],
 )

@@ -245,7 +245,7 @@ def fault_answers() -> Iterator[tuple[str, Any]]:
         state = update_faults(state, present, now_s, catalogue)
         yield (
             f"faults at {now_s}",
-            plain([asdict(state), held_axes(state.active), asdict(worst(state.active) or state)]),
+            plain([asdict(state), frozenset(held_axes(state.active)), asdict(worst(state.active) or state)]),
         )
         for event in Clear:
             yield f"faults at {now_s}, {event}", plain(asdict(clear_faults(state, event)))

@@ -137,7 +137,7 @@ def test_the_dangerous_ones_stop_and_the_lost_ones_disarm() -> None:
 
 def test_a_stale_picture_holds_the_rotation_at_once() -> None:
     state = update_faults(FaultState(), [DeviceFault("camera", "stale", "no frame", 0.0)], 0.0, CATALOGUE)
-    assert held_axes(state.active) == frozenset({"rotation"})
+    assert held_axes(state.active).keys() == frozenset({"rotation"})
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_a_stale_picture_holds_the_rotation_at_once() -> None:
 )
 def test_an_actuator_holds_its_own_axis(device: str, axes: set[str]) -> None:
     state = update_faults(FaultState(), [DeviceFault(device, "overload", "", 0.0)], 1.0, CATALOGUE)
-    assert held_axes(state.active) == axes
+    assert held_axes(state.active).keys() == axes
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.key)

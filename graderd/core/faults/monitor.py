@@ -144,13 +144,14 @@ def row_for(fault: DeviceFault, catalogue: Mapping[str, FaultRow]) -> FaultRow:
     )
 
 
-def held_axes(active: Iterable[ActiveFault]) -> frozenset[str]:
-    """Axes that must stay where they are because of a fault of severity HOLD or above."""
-    axes: frozenset[str] = frozenset()
+def held_axes(active: Iterable[ActiveFault]) -> dict[str, ActiveFault]:
+    """Parts that must stay where they are, each with the worst fault of severity HOLD or above that says so."""
+    held: dict[str, ActiveFault] = {}
     for fault in active:
         if fault.row.reaction >= Reaction.HOLD:
-            axes |= fault.row.axes
-    return axes
+            for part in fault.row.axes:
+                held[part] = worst((held.get(part, fault), fault)) or fault
+    return held
 
 
 def worst(active: Iterable[ActiveFault]) -> ActiveFault | None:
