@@ -186,7 +186,8 @@ async def come_to(stack: Stack, phase: Phase) -> None:
         except CampaignError as error:
             if not attempts_left_n:
                 status = await stack.read_status() or {}
-                raise CampaignError(f"{error} ({status.get('mode')}: {status.get('reason')})") from None
+                told = [(f["name"], f["detail"]) for f in status.get("faults", [])]
+                raise CampaignError(f"{error} ({status.get('mode')}: {status.get('reason')}; {told})") from None
 
 
 async def general(stack: Stack, case: Case, phase: Phase, outcome: Outcome) -> None:
@@ -220,7 +221,8 @@ async def detect(stack: Stack, case: Case, outcome: Outcome, from_s: float) -> N
             return
         await asyncio.sleep(0.015)
     names = [f["name"] for f in stack.status.get("faults", [])]
-    outcome.problems.append(f"not detected; active: {names or 'nothing'}")
+    now = f"{stack.status.get('mode')}: {stack.status.get('reason')}"
+    outcome.problems.append(f"not detected; active: {names or 'nothing'}; {now}")
 
 
 async def react(stack: Stack, case: Case, outcome: Outcome, from_s: float, before: str) -> None:

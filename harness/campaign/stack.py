@@ -81,6 +81,7 @@ class Stack:
         self._control = RigControl(directory / "control.sock")
         self.client = AsyncClient(directory / "graderd.sock", name=CLIENT)
         self._mover: asyncio.Task[None] | None = None
+        self._renewing = True
         self._log_read = 0
 
     # -- processes ----------------------------------------------------------------------------------------------------
@@ -238,6 +239,7 @@ class Stack:
     async def move(self, name: str, /, **fields: Any) -> None:
         """Begin a jog or preset and keep its lease until :meth:`rest`."""
         await self.rest()
+        self._renewing = True
         begun: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._mover = asyncio.create_task(self._keep(name, fields, begun), name="campaign-lease")
         if refusal := await begun:
@@ -253,12 +255,17 @@ class Stack:
                         begun.set_result("")
                     while True:
                         await asyncio.sleep(RENEW_S)
-                        await lease.renew()
+                        if self._renewing:
+                            await lease.renew()
             except ClientError as error:
                 if not begun.done():
                     begun.set_result(str(error))
                 if not isinstance(error, LeaseLostError):
                     return
+
+    def fall_silent(self) -> None:
+        """The client that moves the blade stands still, with its connection open: it renews its lease no more."""
+        self._renewing = False
 
     async def rest(self) -> None:
         """Give the lease back, if it is still held."""

@@ -224,8 +224,8 @@ async def corrupt_state(stack: Stack, case: Case, _: Phase, outcome: Outcome) ->
     outcome.recovered_as_catalogued, outcome.recovery = True, "by itself with the next stop"
 
 
-async def lapse(stack: Stack, case: Case, phase: Phase, outcome: Outcome) -> None:
-    """The client that moves the blade is gone from one moment to the next; nobody renews its lease."""
+async def _moved_by_hand(stack: Stack, phase: Phase) -> None:
+    """In every phase a client moves something, or holds its place."""
     if phase is TURNING:
         await stack.command("manual")
         await stack.watch.until_still(("rotation",), 0.2, 3.0)
@@ -234,14 +234,34 @@ async def lapse(stack: Stack, case: Case, phase: Phase, outcome: Outcome) -> Non
         goal_deg = here_deg if phase is IDLE else (-30.0 if here_deg > 0 else 30.0)
         await stack.move("jog", axis="rotate", value=goal_deg)
         await asyncio.sleep(0.8)
+
+
+async def client_gone(stack: Stack, _: Case, phase: Phase, outcome: Outcome) -> None:
+    """The client that moves the blade ends, and its connection with it: so does what it asked for."""
+    await _moved_by_hand(stack, phase)
     from_s = time.monotonic()
     await stack.rest()
+    status = await stack.until_status(lambda s: not s["lease"], 1.0, "the lease of a client that is gone is still held")
+    outcome.detected, outcome.detection_s = True, max(0.0, status["time_s"] - from_s)
+    outcome.message = status["reason"]
+    still = await stack.watch.until_still(EVERYTHING, STILL_S, 3.0)
+    outcome.standstill_s, outcome.standstill_from = stack.watch.standstill_s(EVERYTHING, from_s), "injection"
+    outcome.final_state, outcome.expected_state = stack.status["mode"], "manual"
+    outcome.safe = still and outcome.standstill_s <= BRAKE_S + SLACK_S
+    outcome.recovered_as_catalogued, outcome.recovery = outcome.final_state == "manual", "by itself"
+
+
+async def lapse(stack: Stack, case: Case, phase: Phase, outcome: Outcome) -> None:
+    """The client that moves the blade stands still with its connection open; nobody renews its lease."""
+    await _moved_by_hand(stack, phase)
+    from_s = time.monotonic()
+    stack.fall_silent()
     await detect(stack, case, outcome, from_s)
     await stack.watch.until_still(EVERYTHING, STILL_S, 3.0)
     await react(stack, case, outcome, from_s, "manual")
     outcome.standstill_s, outcome.standstill_from = stack.watch.standstill_s(EVERYTHING, from_s), "injection"
     if outcome.standstill_s > 0.3 + BRAKE_S + SLACK_S:
-        outcome.problems.append(f"standstill {outcome.standstill_s:.2f} s after the client's death")
+        outcome.problems.append(f"standstill {outcome.standstill_s:.2f} s after the client's last word")
     await stack.until_status(
         lambda s: not any(f["name"] in case.faults for f in s["faults"]), 6.0, "the lapse is told for ever"
     )
@@ -368,8 +388,10 @@ DAEMON = (
     _daemon("config_corrupt", "the configuration is damaged at the next start", "", nothing, conduct=corrupt_config),
     _daemon("state_corrupt", "the state file is damaged at the next start", "daemon.state_file_corrupt", nothing,
             conduct=corrupt_state, short=(IDLE,)),
-    _daemon("client_dead", "the client that moves the blade is gone", "daemon.lease_lapsed", nothing, conduct=lapse,
-            short=(TURNING, LIFTING)),
+    _daemon("client_dead", "the client that moves the blade ends", "", nothing, conduct=client_gone,
+            short=(LIFTING,)),
+    _daemon("client_frozen", "the client that moves the blade stands still", "daemon.lease_lapsed", nothing,
+            conduct=lapse, short=(TURNING, LIFTING)),
     _daemon("flooded", "thousands of API requests a second", "", nothing, conduct=flood, short=(TURNING,)),
     _daemon("malformed", "malformed API requests", "", nothing, conduct=malformed),
     _daemon("stop_pressed", "the stop loop opens", "stop_input.open", loop("open"), loop("closed"), detect_s=0.3,
