@@ -205,15 +205,23 @@ class _Demo:
             raise DemoFailedError(f"not armed: {armed.mode}, {armed.reason}")
         self._show.event("armed")
 
+    async def _command(self, name: str) -> None:
+        """One command; a refusal is told with what brought the machine to where it is refused."""
+        try:
+            await self._client.command(name)
+        except RefusedError as error:
+            status = await self.status()
+            raise DemoFailedError(f"{error}; {status.mode}: {status.reason}") from None
+
     async def one_pass(self, zone: str) -> Pass:
         """Square blade, new soil, automatic operation, settle, drive."""
-        await self._client.command("manual")
+        await self._command("manual")
         await self._rig.request("scene", zone="none")
         await self._rig.request("reset_vehicle")
         await self._square()
         await self._rig.request("scene", zone=zone)
         self._show.event("scene", zone=zone)
-        await self._client.command("auto")
+        await self._command("auto")
         started = await self._decision(zone)
         requested_deg = started.decision.angle_deg
         assert started.decision.zone is not None

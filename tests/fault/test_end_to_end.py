@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import re
 import signal
 import sys
 import time
@@ -69,7 +70,8 @@ async def test_a_demonstration_that_fails_says_why_in_its_last_event(tmp_path: P
     assert process.returncode == 1
     assert last["event"] == "demo_finished"
     assert last["passes"] == []
-    assert "control.sock" in last["reason"]
+    # Whoever notices first: the demonstration, which asks the rig, or the daemon, whose devices are gone.
+    assert re.search(r"control\.sock|\w+\.(unplugged|no_reply|no_feedback|missing)", last["reason"]), last
     assert list(tmp_path.iterdir()) == []
 
 
