@@ -175,8 +175,9 @@ CAMERA = (
     _camera("freeze", "the same picture under new numbers", "frozen", camera("freeze"), detect_s=1.5),
     _camera("black", "no light in the colour picture", "", camera("black"), conduct=by_depth_alone, short=(TURNING,)),
     _camera("blown_out", "the colour picture overexposed", "", camera("blown_out"), conduct=by_depth_alone),
-    _camera("blocked", "something covers both lenses", "blocked", camera("blocked"), detect_s=0.8,
-            short=(TURNING, LIFTING)),
+    _camera(
+        "blocked", "something covers both lenses", "blocked", camera("blocked"), detect_s=0.8, short=(TURNING, LIFTING)
+    ),
     _camera("blurred", "out of focus", "blurred", camera("blurred"), detect_s=2.0),
     _camera("torn", "depth from an earlier frame than colour", "torn", camera("torn"), detect_s=1.2),
     _camera("knocked", "the mount was hit", "knocked", camera("knocked"), detect_s=3.0),
