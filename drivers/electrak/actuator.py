@@ -170,15 +170,18 @@ class ElectrakActuator:
 
         Raises:
             LifecycleError: not in standby.
-            DeviceRefusedError: a fault is present.
+            DeviceRefusedError: a fault is present, or a stop could not be sent now.
             DeviceTimeoutError: feedback is stale.
         """
         now_s = self._clock.now_s()
         self._watch(now_s)
         if self._lifecycle is not Lifecycle.STANDBY:
             raise LifecycleError(self.name, f"cannot arm while {self._lifecycle}", self._remedy())
-        if self._link.address is None:
-            raise DeviceRefusedError(self.name, "graderd has no J1939 address yet", "Wait, or look at the can faults")
+        await self._link.prove_stop(self)
+        now_s = self._clock.now_s()
+        self._watch(now_s)
+        if self._lifecycle is not Lifecycle.STANDBY:
+            raise LifecycleError(self.name, f"became {self._lifecycle} while it was armed", self._remedy())
         if self._track.age_s(now_s) > self.settings.feedback_timeout_s:
             raise DeviceTimeoutError(self.name, f"feedback is {self._track.age_s(now_s):.2f} s old")
         standing = [flag for flag in ("overload", "fatal") if flag in self._track.flags]

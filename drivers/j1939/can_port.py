@@ -15,7 +15,7 @@ import select
 import socket
 import struct
 from pathlib import Path
-from typing import Final, Literal
+from typing import ClassVar, Final, Literal
 
 from graderd.drivers.j1939.bus_health import ERROR_FRAMES, BusEvent, event_of
 from graderd.drivers.j1939.ids import Frame
@@ -58,7 +58,12 @@ def lost_from(error: BaseException) -> PortLostError:
 
 
 class BusPort:
-    """Any python-can bus with a file descriptor; without one, a thread carries its frames to a pipe."""
+    """Any python-can bus with a file descriptor; without one, a thread carries its frames to a pipe.
+
+    ``refuses_later``: a frame that :meth:`send` took may be refused afterwards, by a :attr:`BusEvent.REFUSED`.
+    """
+
+    refuses_later: ClassVar[bool] = False
 
     def __init__(self, bus: can.BusABC) -> None:
         self.bus = bus
@@ -204,6 +209,8 @@ class SocketCanPort(BusPort):
 
 class SlcanPort(BusPort):
     """An slcan adapter on a serial port or pseudo-terminal."""
+
+    refuses_later = True
 
     def __init__(self, bus: QuietSlcanBus) -> None:
         super().__init__(bus)

@@ -29,7 +29,7 @@ from graderd.drivers.j1939.stop_message import StopWatcher
 from graderd.drivers.j1939.ticker import Ticker
 from graderd.drivers.j1939.transport import Message
 from graderd.hal.clock import Clock, SystemClock
-from graderd.hal.errors import DeviceError, DeviceLostError, DeviceMissingError
+from graderd.hal.errors import DeviceError, DeviceLostError, DeviceMissingError, DeviceRefusedError
 from graderd.hal.fault import DeviceFault
 from graderd.hal.settings import CanSettings
 
@@ -83,6 +83,8 @@ their period to some microseconds. What is left of it is spun, ten times a secon
 _BACKOFF_FIRST_S: Final = 0.1
 _BACKOFF_MAX_S: Final = 2.0
 _CLOSE_REPEATS_N: Final = 3
+_REFUSED_WITHIN_S: Final = 0.05
+"""An adapter's answer to a frame comes within milliseconds; one that is full says so at once."""
 _STOP_UNADDRESSED_S: Final = 2.0
 """For so long after the address was lost, or the bus opened, motion is ended from the address that was ours last."""
 
@@ -288,6 +290,29 @@ class CanLink:
         """Send one device's control message now; False where that is impossible."""
         frame = self._control(user)
         return frame is not None and self._send(frame)
+
+    async def prove_stop(self, user: LinkUser) -> None:
+        """Say now what a stop will say, and see it taken: what :meth:`arm` of a device on the bus asks for.
+
+        The device's control message is the one that ends motion while it is in standby; the stop path sends no other,
+        by no other way, and no limit of ours counts it. An adapter that refuses afterwards has 50 ms for it.
+
+        Raises:
+            DeviceRefusedError: we have no address, or it does not leave.
+        """
+        where = f"address {user.address} on {self.where}"
+        before = self._untold_n()
+        if self._node.address is None:
+            raise DeviceRefusedError(where, "graderd has no J1939 address", "Wait, or look at the can faults")
+        sent = self.send_control(user)
+        if sent and self._port is not None and self._port.refuses_later:
+            await asyncio.sleep(_REFUSED_WITHIN_S)
+        if not sent or self._untold_n() != before or self._node.address is None or self._port is None:
+            raise DeviceRefusedError(where, "a stop would not leave now", "Look at the can faults, then arm")
+
+    def _untold_n(self) -> int:
+        """Frames so far that the bus did not take."""
+        return self.counters.tx_full_n + self.counters.refused_n + self.counters.lost_n
 
     def request(self, pgn: int, destination: int = 0xFF) -> None:
         """Ask for a parameter group; the answer comes through :meth:`tap_messages`."""

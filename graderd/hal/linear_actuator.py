@@ -76,9 +76,11 @@ class LinearActuator(Protocol):
     async def arm(self) -> None:
         """standby -> active: motion may be enabled from now on; nothing moves until a target is set.
 
+        Everything that a stop will write is written, or tried, first: a stop is never the first time.
+
         Raises:
             LifecycleError: not in standby.
-            DeviceError: feedback is stale or a fault is present.
+            DeviceError: feedback is stale, a fault is present, or a stop could not be sent now.
         """
         ...
 

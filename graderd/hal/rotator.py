@@ -84,6 +84,8 @@ class Rotator(Protocol):
     async def arm(self) -> None:
         """standby -> active: write and read back limits, profile and watchdog, set goal := measured, torque on.
 
+        Everything that a stop will write is written, or tried, first: a stop is never the first time.
+
         Raises:
             LifecycleError: not in standby.
             DeviceError: anything did not read back as written; torque stays off.

@@ -94,6 +94,14 @@ class AxisStand(ABC):
     async def restore_wire(self) -> None:
         """Undo it."""
 
+    @abstractmethod
+    def mute(self) -> None:
+        """Nothing that the driver sends gets through any more, and where it can be, it hears the device on."""
+
+    @abstractmethod
+    def unmute(self) -> None:
+        """Undo it."""
+
     def faults(self) -> tuple[DeviceFault, ...]:
         """What it tells, but for what the transport under it brings about (``of_the_wire``)."""
         return tuple(f for f in self.device.faults() if f.name not in self.of_the_wire)
@@ -190,6 +198,20 @@ class _AxisConformance:
         with pytest.raises(LifecycleError):
             await stand.device.arm()
         await stand.wait(0.3)
+        assert stand.true_position() == pytest.approx(before, abs=stand.still)
+
+    async def test_it_is_not_armed_while_its_stop_could_not_be_sent(self, stand: AxisStand) -> None:
+        """What will be written to stop it is written, and found taken, before anything can move."""
+        await stand.device.open()
+        before = stand.true_position()
+        stand.mute()
+        with pytest.raises(DeviceError):
+            await stand.device.arm()
+        assert state(stand.device) is not Lifecycle.ACTIVE
+        stand.unmute()
+        await stand.until(lambda: state(stand.device) is Lifecycle.STANDBY)
+        await stand.until(lambda: not stand.faults())
+        await stand.device.arm()
         assert stand.true_position() == pytest.approx(before, abs=stand.still)
 
     async def test_a_goal_is_reached_and_told(self, stand: AxisStand) -> None:

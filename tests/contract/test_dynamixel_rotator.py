@@ -40,6 +40,12 @@ class Ph54Stand(RotatorStand):
     def true_position(self) -> float:
         return self.bench.servo.shaft_deg
 
+    def mute(self) -> None:
+        self.bench.bus.inject("drop_requests")
+
+    def unmute(self) -> None:
+        self.bench.bus.clear_faults()
+
     async def lose_wire(self) -> None:
         await self.bench.bus.unplug()
 

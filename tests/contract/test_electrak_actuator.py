@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import pytest
 
 from graderd.drivers.electrak import CanLink, ElectrakActuator
-from graderd.drivers.j1939.can_port import BusPort
+from graderd.drivers.j1939.can_port import BusPort, PortFullError, SlcanPort
+from graderd.drivers.j1939.ids import Frame
 from graderd.drivers.j1939.python_can import can
 from graderd.hal.device import Lifecycle
 from graderd.hal.errors import (
@@ -102,6 +103,7 @@ class ElectrakStand(ActuatorStand):
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
         self.clock = bench.clock
+        self._send: Callable[[Frame], None] | None = None
 
     @property
     def device(self) -> ElectrakActuator:
@@ -109,6 +111,25 @@ class ElectrakStand(ActuatorStand):
 
     def true_position(self) -> float:
         return self.bench.unit.position_mm
+
+    def mute(self) -> None:
+        port = self.bench.link._port
+        assert port is not None
+        if isinstance(port, SlcanPort):
+            self.bench.bus.inject("adapter_refuses")
+            return
+
+        def refuse(frame: Frame) -> None:
+            raise PortFullError(f"no buffer space for {frame.can_id:X}")
+
+        self._send = port.send
+        port.send = refuse  # type: ignore[method-assign]
+
+    def unmute(self) -> None:
+        self.bench.bus.clear_faults()
+        port = self.bench.link._port
+        if port is not None and self._send is not None:
+            port.send = self._send  # type: ignore[method-assign, assignment]
 
     async def lose_wire(self) -> None:
         self.bench.bus.inject("silence")

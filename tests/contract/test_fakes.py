@@ -7,6 +7,7 @@ import asyncio
 import pytest
 
 from graderd.hal.clock import Clock, ManualClock, SystemClock
+from graderd.hal.errors import DeviceRefusedError
 from harness.awake_clock import AwakeClock
 from harness.fakes import FakeActuator, FakeRotator
 from tests.contract.conformance import (
@@ -34,6 +35,12 @@ class FakeRotatorStand(RotatorStand):
 
     def true_position(self) -> float:
         return self.fake.position
+
+    def mute(self) -> None:
+        self.fake.refuse_arm = DeviceRefusedError(self.fake.name, "cannot be told anything")
+
+    def unmute(self) -> None:
+        self.fake.refuse_arm = None
 
     async def lose_wire(self) -> None:
         self.fake.lose()
@@ -63,6 +70,12 @@ class FakeActuatorStand(ActuatorStand):
 
     def true_position(self) -> float:
         return self.fake.position
+
+    def mute(self) -> None:
+        self.fake.refuse_arm = DeviceRefusedError(self.fake.name, "cannot be told anything")
+
+    def unmute(self) -> None:
+        self.fake.refuse_arm = None
 
     async def lose_wire(self) -> None:
         self.fake.lose()

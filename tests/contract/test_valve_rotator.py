@@ -26,7 +26,7 @@ import pytest
 from graderd.config import ConfigError, parse
 from graderd.core.status import Status
 from graderd.drivers.backend import Parts, RotatorBackend
-from graderd.drivers.j1939.can_port import BusPort, PortLostError, open_port
+from graderd.drivers.j1939.can_port import BusPort, PortFullError, PortLostError, open_port
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of
 from graderd.drivers.j1939.link import CanLink, name_from
 from graderd.hal.clock import Clock
@@ -34,7 +34,6 @@ from graderd.hal.device import DeviceService, Lifecycle, NoArguments
 from graderd.hal.errors import (
     CommandRangeError,
     DeviceLostError,
-    DeviceRefusedError,
     DeviceTimeoutError,
     LifecycleError,
 )
@@ -148,8 +147,8 @@ class ValveRotator:
 
     async def arm(self) -> None:
         self._require(Lifecycle.STANDBY)
-        if self._link.address is None:
-            raise DeviceRefusedError("rotation", "graderd lost its J1939 address", "Look at the can faults")
+        await self._link.prove_stop(self)
+        self._require(Lifecycle.STANDBY)  # still: that took a moment
         self._goal = None
         self._lifecycle = Lifecycle.ACTIVE
 
@@ -329,6 +328,21 @@ class ValveStand(RotatorStand):
 
     def true_position(self) -> float:
         return self.valve.angle_deg
+
+    def mute(self) -> None:
+        port = self.link._port
+        assert port is not None
+
+        def refuse(frame: Frame) -> None:
+            raise PortFullError(f"no buffer space for {frame.can_id:X}")
+
+        self._send = port.send
+        port.send = refuse  # type: ignore[method-assign]
+
+    def unmute(self) -> None:
+        port = self.link._port
+        assert port is not None
+        port.send = self._send  # type: ignore[method-assign]
 
     async def lose_wire(self) -> None:
         self.valve.powered = False
