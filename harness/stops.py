@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import sys
 import time
@@ -62,13 +63,32 @@ async def stopped_in_motion(stack: Stack, phase: Phase, way: Callable[[Stack], A
     asked_s = time.monotonic()
     await way(stack)
     took_s = time.monotonic() - asked_s
+    return {"took_s": took_s, **await what_came_of(stack, asked_s)}
+
+
+async def what_came_of(stack: Stack, asked_s: float) -> dict[str, float]:
+    """Of a stop that was asked for at ``asked_s``: seconds until the servo had its last goal (``servo_s``), until each
+    actuator that had leave to move had the message that took it back (``can_s``; infinite where one never had), until
+    every axis stood (``still_s``), and how far the blade turned meanwhile (``way_deg``)."""
     await stack.rest()
     assert await stack.watch.until_still(EVERYTHING, 0.3, 4.0)
     state = stack.watch.newest().state
-    latest_enabled_s = max(state[f"{name}_enabled_s"] or 0.0 for name in ("lift_left", "lift_right", "tilt"))
+    last_s = asked_s
+    for name in ("lift_left", "lift_right", "tilt"):
+        allowed_s, forbidden_s = state[f"{name}_enabled_s"], state[f"{name}_disabled_s"]
+        if allowed_s is not None:
+            last_s = max(last_s, math.inf if forbidden_s is None or forbidden_s < allowed_s else forbidden_s)
     return {
-        "took_s": took_s,
-        "servo_s": state["servo_goal_written_s"] - asked_s,
-        "can_s": max(0.0, latest_enabled_s - asked_s),
+        "servo_s": max(0.0, state["servo_goal_written_s"] - asked_s),
+        "can_s": last_s - asked_s,
         "still_s": stack.watch.standstill_s(EVERYTHING, asked_s),
+        "way_deg": abs(state["blade_deg"] - _blade_deg(stack, asked_s)),
     }
+
+
+def _blade_deg(stack: Stack, at_s: float) -> float:
+    """Where the blade was, between two samples."""
+    after = next(n for n, sample in enumerate(stack.watch.samples) if sample.time_s >= at_s)
+    first, second = stack.watch.samples[max(0, after - 1)], stack.watch.samples[after]
+    share = (at_s - first.time_s) / max(1e-6, second.time_s - first.time_s)
+    return float(first.state["blade_deg"] + share * (second.state["blade_deg"] - first.state["blade_deg"]))

@@ -23,9 +23,9 @@ import graderd
 from graderd.config import Config
 from graderd.core import commands as cmd
 from graderd.core import readiness
-from graderd.core.axes import ACTUATORS, AXES
+from graderd.core.axes import ACTUATORS, AXES, PARTS
 from graderd.core.faults.catalogue import CATALOGUE
-from graderd.core.faults.monitor import Clear, Reaction
+from graderd.core.faults.monitor import ALL_AXES, Clear, Reaction, held_axes
 from graderd.core.machine import Mode
 from graderd.core.soil import SoilObservation, Zone
 from graderd.core.tick import AxisSensed, Controller, Sensed, Tick
@@ -194,7 +194,9 @@ def test_a_held_axis_has_not_arrived() -> None:
 
 def test_a_latch_is_let_go_only_by_what_the_machine_accepts() -> None:
     """A jammed servo that came free, a reset with nothing to reset: the hold stays until the machine is armed anew."""
-    latching = next(row for row in CATALOGUE.values() if row.clear is Clear.ON_REARM and row.reaction is Reaction.HOLD)
+    latching = next(
+        row for row in CATALOGUE.values() if row.clear is Clear.ON_REARM and row.reaction is Reaction.RETREAT
+    )
     device, _, condition = latching.key.replace("actuator", "lift_left").partition(".")
     controller, step = Controller(SETTINGS), partial(Sensed, powered=True)
     jammed = (DeviceFault(device, condition, "", 1.0),)
@@ -213,6 +215,64 @@ def test_a_latch_is_let_go_only_by_what_the_machine_accepts() -> None:
     assert not refused.replies[0].accepted
     assert refused.faults
     assert not controller.step(Sensed(5.2, off(5.2), commands=(cmd.Arm(),))).faults
+
+
+@pytest.mark.parametrize("mode", [Mode.AUTO, Mode.MANUAL])
+@pytest.mark.parametrize("key", sorted(key for key, row in CATALOGUE.items() if row.reaction >= Reaction.HOLD))
+def test_no_fault_that_goes_lets_motion_go_on_without_a_fresh_decision_or_a_command(key: str, mode: Mode) -> None:
+    part, _, condition = key.partition(".")
+    row, device = CATALOGUE[key], "lift_left" if part == "actuator" else part
+    turning = "rotation" if mode is Mode.AUTO or "rotation" in row.axes else "tilt"
+    if mode is Mode.MANUAL and row.axes <= {"lift", "own"} and row.axes:
+        turning = "lift_left"
+    controller, at, goals, sent = Controller(SETTINGS), dict(HOME), dict[str, float](), list[float]()
+    struck_n: int | None = None
+    commands: dict[int, tuple[cmd.AnyCommand, ...]] = {3: (cmd.Arm(client="a"),)}
+    powered, held = False, frozenset[str]()
+    for number in range(400):
+        now_s = 100.0 + TICK_S * number
+        if struck_n is None and turning in goals and abs(at[turning] - HOME[turning]) > 1.0:
+            struck_n = number
+        present = struck_n is not None and number - struck_n <= (row.debounce_s + 0.1) / TICK_S
+        if struck_n is not None and number - struck_n > (row.debounce_s + 0.1) / TICK_S + 40:
+            break
+        if mode is Mode.AUTO:
+            commands[8] = (cmd.Auto(client="a"),)
+        elif number == 8:
+            axis = {"rotation": "rotate", "lift_left": "height", "tilt": "pitch"}[turning]
+            commands[8] = (cmd.Jog(axis=axis, value=5.0, relative=True, client="a"),)
+        elif number > 8:
+            commands[number] = (cmd.Renew(client="a"),)
+        seen = SoilObservation(now_s - 0.03, Zone.LEFT, 0.9, "", 0.8, 0.15, 0.05, frame_number=number)
+        tick = controller.step(
+            Sensed(
+                now_s,
+                standing(now_s, at, Lifecycle.ACTIVE if powered else Lifecycle.STANDBY, goals),
+                faults=(DeviceFault(device, condition, "", now_s),) if present else (),
+                commands=commands.get(number, ()),
+                observation=seen if number % 2 and struck_n is None else None,
+                powered=powered,
+            )
+        )
+        powered = tick.intents.power
+        if not held and tick.faults:
+            ends = row.reaction >= Reaction.DISARM or (row.reaction is Reaction.RETREAT and mode is Mode.AUTO)
+            held = held_axes(tick.faults) if mode is Mode.AUTO or not row.automatic_only else held
+            held = ALL_AXES if ends else held
+        sent += [d.send for axis, d in tick.axes.items() if PARTS[axis] in held and d.send is not None]
+        goals = {
+            axis: decided.send if decided.send is not None else goals[axis]
+            for axis, decided in tick.axes.items()
+            if decided.send is not None or (axis in goals and not decided.hold)
+        }
+        for axis, goal in goals.items():
+            at[axis] += max(-FASTEST[axis] * TICK_S, min(goal - at[axis], FASTEST[axis] * TICK_S))
+    assert struck_n is not None, "it never moved"
+    assert sent == []
+    if row.reaction >= Reaction.RETREAT:
+        assert tick.state.mode is not Mode.AUTO
+        if mode is Mode.AUTO:
+            assert row.reads in tick.state.reason
 
 
 async def test_a_stop_makes_void_what_was_asked_before_it(tmp_path: Path) -> None:

@@ -104,6 +104,26 @@ def test_the_remedy_says_how_a_latched_fault_ends(row: FaultRow) -> None:
         assert "reset" in row.remedy
 
 
+HANDS = re.compile(
+    r"\b(free|lift the|load off|lens|mount|linkage|cables?|connectors?|shield|terminat\w+|wires|wiring|label|brake|"
+    r"measure|plug|exchange|coupling|port|give one)\b"
+)
+"""What somebody does, or goes to, at the blade, its devices or their cables."""
+
+
+@pytest.mark.parametrize("row", [r for r in ROWS if r.reaction < Reaction.RETREAT], ids=lambda row: row.key)
+def test_whoever_is_sent_to_the_machine_finds_automatic_operation_ended(row: FaultRow) -> None:
+    if HANDS.search(row.remedy):
+        assert "disarm" in row.remedy, "make it a retreat, or say that the machine is disarmed first"
+    if row.reaction is Reaction.HOLD:
+        assert row.clear is Clear.WHEN_GONE, "a latch waits for a person, and automatic operation ends for him"
+
+
+@pytest.mark.parametrize("row", [r for r in ROWS if r.reaction is Reaction.RETREAT], ids=lambda row: row.key)
+def test_a_remedy_after_a_retreat_says_how_to_go_on(row: FaultRow) -> None:
+    assert re.search(r"\barm\b|'graderd (auto|calibrate|jog)", row.remedy)
+
+
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.key)
 def test_commands_named_in_a_remedy_exist(row: FaultRow, capsys: pytest.CaptureFixture[str]) -> None:
     for text in re.findall(r"'graderd ([a-z ]+)", row.remedy):

@@ -2,8 +2,8 @@
 
 An actuator that cannot be heard or is not the one configured may be anywhere: DISARM. So does one that switched off
 or stuck in the middle of a move: its driver lets no motion through until it is armed again, and the blade may stand
-askew. One that is heard but may not begin a move holds its own axis, the other lift with it. An actuator rests
-unpowered on its brake.
+askew. One that is heard but may not begin a move holds its own axis, the other lift with it; where a person has to go
+to it, automatic operation ends too: RETREAT. An actuator rests unpowered on its brake.
 """
 
 from graderd.core.faults.monitor import Clear, FaultRow, Reaction
@@ -49,7 +49,7 @@ ROWS = (
         "an actuator refuses graderd's messages as out of its range",
         "profile or settings do not fit this model (stroke, current or speed)",
         "compare profile, max_mm and current_limit_a with the actuator's label; then disarm and arm",
-        Reaction.HOLD,
+        Reaction.RETREAT,
         clear=Clear.ON_REARM,
         axes=OWN,
     ),
@@ -57,7 +57,7 @@ ROWS = (
         "actuator.saturation",
         "an actuator works close to the most it can do",
         "a heavy load, or a low supply voltage",
-        "take smaller cuts; check the supply voltage under load",
+        "take smaller cuts; disarm before anybody goes to the supply",
         Reaction.WARN,
         debounce_s=1.0,
     ),
@@ -66,7 +66,7 @@ ROWS = (
         "an actuator is moved by its load",
         "the load is larger than its brake holds, or its brake is worn",
         "lower the blade to the ground, do not stand under or before it; have the actuator's brake checked; then arm",
-        Reaction.HOLD,
+        Reaction.RETREAT,
         clear=Clear.ON_REARM,
         axes=OWN,
     ),
@@ -82,8 +82,8 @@ ROWS = (
         "actuator.voltage",
         "an actuator's supply voltage is out of its range: it begins no new move",
         "a weak battery, a thin or long cable, or another nominal voltage",
-        "measure the voltage at the actuator while it moves, correct the supply",
-        Reaction.HOLD,
+        "measure the voltage at the actuator while it moves, correct the supply; then 'graderd auto' again",
+        Reaction.RETREAT,
         debounce_s=0.3,
         axes=OWN,
     ),
@@ -118,7 +118,7 @@ ROWS = (
         "an actuator moves and hardly comes nearer to where it is told to go",
         "a load that it barely overcomes, or a low supply voltage",
         "take some load off the blade, measure the voltage at the actuator while it moves; then disarm and arm",
-        Reaction.HOLD,
+        Reaction.RETREAT,
         clear=Clear.ON_REARM,
         axes=OWN,
     ),

@@ -1,12 +1,14 @@
 """Faults of the servo that turns the blade, and of its bus.
 
 A servo that is lost, alarmed or not in the state it was put into cannot be commanded: DISARM. A blade that moves
-where nobody sent it is the most dangerous thing this machine can do: STOP, until a person has looked.
+where nobody sent it is the most dangerous thing this machine can do: STOP, until a person has looked. What sends a
+person to the blade, or to the servo's cable, ends automatic operation: RETREAT.
 """
 
 from graderd.core.faults.monitor import Clear, FaultRow, Reaction
 
 ROTATION = frozenset({"rotation"})
+AGAIN = "then 'graderd auto' again"
 REBOOT = "take the load off the blade, 'graderd rotation reboot', then arm"
 
 ROWS = (
@@ -21,8 +23,8 @@ ROWS = (
         "rotation.corrupt_replies",
         "answers of the blade servo arrive damaged",
         "a disturbed or badly terminated RS-485 line, a loose shield, or two servos with one id",
-        "check cable, shield and termination; keep the line away from motor cables",
-        Reaction.HOLD,
+        f"check cable, shield and termination; keep the line away from motor cables; {AGAIN}",
+        Reaction.RETREAT,
         debounce_s=0.2,
         axes=ROTATION,
     ),
@@ -118,7 +120,7 @@ ROWS = (
         "the blade is told to turn and does not",
         "the blade is stuck, the load is too large for the current limit, or the coupling slips",
         "lift and free the blade, look at coupling and current limit; then disarm and arm",
-        Reaction.HOLD,
+        Reaction.RETREAT,
         clear=Clear.ON_REARM,
         axes=ROTATION,
     ),
@@ -127,7 +129,7 @@ ROWS = (
         "the blade moves and hardly comes nearer to where it is told to go",
         "a load that the servo barely overcomes, a low supply voltage, or settings that let it swing about its goal",
         "take some load off the blade, look at supply and current limit; then disarm and arm",
-        Reaction.HOLD,
+        Reaction.RETREAT,
         clear=Clear.ON_REARM,
         axes=ROTATION,
     ),
@@ -159,7 +161,7 @@ ROWS = (
         "rotation.voltage_near_limit",
         "the blade servo's supply voltage is close to its limit",
         "the battery runs low, or braking drives the voltage up",
-        "charge or exchange the battery soon; look at the supply's cable",
+        "charge or exchange the battery soon; disarm before you look at the supply's cable",
         Reaction.WARN,
         debounce_s=0.5,
     ),
@@ -167,7 +169,7 @@ ROWS = (
         "rotation.temperature_near_limit",
         "the blade servo is getting hot",
         "a heavy load for a long time, or no air around it",
-        "take some load off or pause, before it switches off",
+        "take smaller cuts or pause, before it switches off",
         Reaction.WARN,
         debounce_s=1.0,
     ),
@@ -189,7 +191,7 @@ ROWS = (
         "servo_bus.lossy",
         "more than a twentieth of what is asked of the blade servo goes without an answer",
         "a disturbed or badly terminated RS-485 line, a loose connector, or a computer that is overloaded",
-        "check cable, shield and termination before it is lost; repeats make up for it until then",
+        "repeats make up for it; disarm, then check cable, shield and termination before it is lost",
         Reaction.WARN,
         debounce_s=1.0,
     ),
