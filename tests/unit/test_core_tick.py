@@ -257,7 +257,7 @@ def test_no_fault_that_goes_lets_motion_go_on_without_a_fresh_decision_or_a_comm
         powered = tick.intents.power
         if not held and tick.faults:
             ends = row.reaction >= Reaction.DISARM or (row.reaction is Reaction.RETREAT and mode is Mode.AUTO)
-            held = held_axes(tick.faults) if mode is Mode.AUTO or not row.automatic_only else held
+            held = frozenset(held_axes(tick.faults)) if mode is Mode.AUTO or not row.automatic_only else held
             held = ALL_AXES if ends else held
         sent += [d.send for axis, d in tick.axes.items() if PARTS[axis] in held and d.send is not None]
         goals = {
