@@ -6,7 +6,7 @@ extension (the actuators).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Literal, Self
@@ -20,7 +20,7 @@ UNITS: Final = MappingProxyType({"rotation": "deg"} | dict.fromkeys(ACTUATORS, "
 PARTS: Final = MappingProxyType({"rotation": "rotation", "lift_left": "lift", "lift_right": "lift", "tilt": "tilt"})
 """What of the blade an axis moves: a fault that holds one lift holds both."""
 
-_FIELDS: Final = MappingProxyType({"rotation": "rotation_deg"} | {name: f"{name}_mm" for name in ACTUATORS})
+_FIELDS: Final = {"rotation": "rotation_deg"} | {name: f"{name}_mm" for name in ACTUATORS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +55,14 @@ class _ByAxis:
         value: float | None = getattr(self, _FIELDS[axis])
         return value
 
-    def items(self) -> Iterator[tuple[str, float | None]]:
+    def items(self) -> tuple[tuple[str, float | None], ...]:
         """Axis and value, in the order of :data:`AXES`."""
-        return ((axis, self[axis]) for axis in AXES)
+        return (
+            ("rotation", self.rotation_deg),
+            ("lift_left", self.lift_left_mm),
+            ("lift_right", self.lift_right_mm),
+            ("tilt", self.tilt_mm),
+        )
 
     @classmethod
     def of(cls, **values: float | None) -> Self:

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Final
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
 
 from pydantic import Field
 
@@ -44,8 +44,7 @@ _STANDING_SHARE: Final = 0.2
 to be told as not moving, too little to snap far when it comes free."""
 
 
-@dataclass(frozen=True, slots=True)
-class Setpoint:
+class Setpoint(NamedTuple):
     """Where an axis's goal is now and how fast it moves, per second; ``armed_at`` is the middle of its window.
 
     ``moved_at``: where the axis was when it last moved; ``standing_s``: since when it has not followed its goal.
@@ -67,8 +66,7 @@ class GateState:
     setpoints: Mapping[str, Setpoint] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class GateInputs:
+class GateInputs(NamedTuple):
     """``dt_s``: since the last pass. ``height_mm``: of the cutting edge, None where unknown. ``lease_ok``: the client
     that asked for the motion still holds its lease, or nobody's lease is needed (automatic operation)."""
 
@@ -81,8 +79,7 @@ class GateInputs:
     height_mm: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class AxisPass:
+class AxisPass(NamedTuple):
     """What became of one axis's goal. ``limited`` None: hold. ``reason``: why it is not what was requested.
 
     ``bounded``: the nearest to what was requested that limits and window let it have; None where it may not move.
@@ -104,7 +101,7 @@ def pass_gate(
     dt_s = min(inputs.dt_s, LONGEST_STEP_S)
     formers = {axis: _former(state, axis, inputs) for axis in AXES}
     passed = {axis: _permit(axis, goals[axis], formers[axis], inputs) for axis in AXES}
-    paced = pace_lifts(Goals.of(**{axis: passed[axis].bounded for axis in LIFTS}))
+    paced = pace_lifts(Goals(lift_left_mm=passed["lift_left"].bounded, lift_right_mm=passed["lift_right"].bounded))
     setpoints: dict[str, Setpoint] = {}
     for axis in AXES:
         result, measured, former = passed[axis], inputs.pose[axis], formers[axis]
@@ -120,16 +117,16 @@ def pass_gate(
             former = Setpoint(measured, 0.0, former.armed_at)
         figures = inputs.figures[axis]
         if axis in LIFTS:
-            advanced = replace(former, position=_bound(wanted, figures, former.armed_at)[0])
+            advanced = former._replace(position=_bound(wanted, figures, former.armed_at)[0])
             setpoints[axis] = _lead(advanced, measured, figures, figures.lead)
         else:
             if figures.profile_in_device:  # a second profile before the device's own would only fight it
-                advanced = replace(former, position=wanted, speed=0.0)
+                advanced = former._replace(position=wanted, speed=0.0)
             else:
                 advanced = _fence(_advance(former, wanted, figures, dt_s), former, figures)
             advanced = _watch(advanced, measured, figures, inputs.dt_s)
             setpoints[axis] = _lead(advanced, measured, figures, _lead_of(advanced, figures))
-        passed[axis] = replace(result, limited=setpoints[axis].position)
+        passed[axis] = AxisPass(result.requested, setpoints[axis].position, result.reason, result.bounded)
     return GateState(setpoints), passed
 
 
@@ -208,8 +205,8 @@ def _advance(former: Setpoint, goal: float, figures: AxisFigures, dt_s: float) -
     position = former.position + speed * dt_s
     near = abs(goal - position) <= step_speed * dt_s and abs(speed) <= 2.0 * step_speed
     if near and abs(distance) <= figures.speed * dt_s:
-        return replace(former, position=goal, speed=0.0)
-    return replace(former, position=position, speed=speed)
+        return former._replace(position=goal, speed=0.0)
+    return former._replace(position=position, speed=speed)
 
 
 def _fence(setpoint: Setpoint, former: Setpoint, figures: AxisFigures) -> Setpoint:
@@ -218,15 +215,15 @@ def _fence(setpoint: Setpoint, former: Setpoint, figures: AxisFigures) -> Setpoi
     low, high = min(bounded, former.position), max(bounded, former.position)
     if low <= setpoint.position <= high:
         return setpoint
-    return replace(setpoint, position=min(max(setpoint.position, low), high), speed=0.0)
+    return setpoint._replace(position=min(max(setpoint.position, low), high), speed=0.0)
 
 
 def _watch(setpoint: Setpoint, measured: float, figures: AxisFigures, dt_s: float) -> Setpoint:
     """Notice whether the axis follows its goal, or stands although it is asked to move."""
     moved = setpoint.moved_at is None or abs(measured - setpoint.moved_at) > _MOVED_SHARE * figures.lead
     if moved or abs(setpoint.position - measured) <= figures.tolerance:
-        return replace(setpoint, moved_at=measured, standing_s=0.0)
-    return replace(setpoint, standing_s=setpoint.standing_s + dt_s)
+        return setpoint._replace(moved_at=measured, standing_s=0.0)
+    return setpoint._replace(standing_s=setpoint.standing_s + dt_s)
 
 
 def _lead_of(setpoint: Setpoint, figures: AxisFigures) -> float:
@@ -240,4 +237,4 @@ def _lead(setpoint: Setpoint, measured: float, figures: AxisFigures, lead: float
     if abs(setpoint.position - measured) <= lead:
         return setpoint
     position = measured + math.copysign(lead, setpoint.position - measured)
-    return replace(setpoint, position=min(max(position, figures.low), figures.high), speed=0.0)
+    return setpoint._replace(position=min(max(position, figures.low), figures.high), speed=0.0)

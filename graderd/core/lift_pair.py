@@ -13,12 +13,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 from pydantic import Field, model_validator
 
 from graderd.core.axes import LIFTS, AxisFigures, Goals
-from graderd.hal.fault import DeviceFault
+from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.settings import Positive, Settings
 
 
@@ -72,24 +72,21 @@ class LiftPairSettings(Settings):
         return self
 
 
-@dataclass(frozen=True, slots=True)
-class SideReading:
+class SideReading(NamedTuple):
     """Measured extension of one lift and the monotonic time it was measured at."""
 
     position_mm: float
     time_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class SideCommand:
+class SideCommand(NamedTuple):
     """What one lift shall do now: go to ``target_mm`` at ``speed_share`` (0 exclusive to 1), or hold (None)."""
 
     target_mm: float | None
     speed_share: float = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class PairCommand:
+class PairCommand(NamedTuple):
     """Commands for both sides; ``apart_mm`` is how far they are from being level with each other on their way.
 
     ``condition`` is ``sides_apart`` or empty; ``stopped`` says why both hold until the pair is released, or is empty.
@@ -429,7 +426,7 @@ class LiftCoordinator:
         self._pair = LiftPair(settings, min(figures[axis].speed for axis in LIFTS))
         self._targets: tuple[float, float] | None = None
         self._last: PairCommand | None = None
-        self._since_s: float | None = None
+        self._faults = PresentFaults("lift_left")
 
     @property
     def stopped(self) -> str:
@@ -449,21 +446,23 @@ class LiftCoordinator:
             if self._targets is not None:
                 self._pair.release()
             self._targets = self._last = None
+            self._faults.clear_all()
             return Goals()
         targets = (goals.lift_left_mm, goals.lift_right_mm)
         if self._targets is not None and self.stopped and _differ(targets, self._targets):
             self._pair.release()
         self._targets = targets
         command = self._last = self._pair.step(now_s, left, right, *targets)
-        self._since_s = (self._since_s or now_s) if command.condition or command.stopped else None
+        if command.condition or command.stopped:
+            detail = command.stopped or f"{command.apart_mm:.1f} mm apart on their way"
+            self._faults.set("sides_apart", detail, now_s)
+        else:
+            self._faults.clear("sides_apart")
         return Goals(lift_left_mm=command.left.target_mm, lift_right_mm=command.right.target_mm)
 
-    def faults(self) -> tuple[DeviceFault, ...]:
+    def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """``sides_apart`` while the sides are further apart than allowed, or one stopped the other."""
-        if self._last is None or self._since_s is None:
-            return ()
-        detail = self._last.stopped or f"{self._last.apart_mm:.1f} mm apart on their way"
-        return (DeviceFault("lift_left", "sides_apart", detail, self._since_s),)
+        return self._faults.present(now_s)
 
 
 def _differ(one: tuple[float, float], other: tuple[float, float]) -> bool:

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from types import MappingProxyType
+from typing import NamedTuple
 
 from pydantic import Field
 
@@ -31,6 +33,7 @@ class Mode(StrEnum):
 
 ARMED = (Mode.MANUAL, Mode.AUTO)
 STANDSTILL = "daemon.loop_blocked"
+NOTHING_HELD: Mapping[str, str] = MappingProxyType({})
 
 
 class MachineSettings(Settings):
@@ -84,8 +87,7 @@ class State:
     holding: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Inputs:
+class Inputs(NamedTuple):
     """What is known at one tick.
 
     ``observation``: a new one, not handed in before. ``travel``: how the machine drives, None where it does not say.
@@ -101,10 +103,10 @@ class Inputs:
     commands: tuple[cmd.Command, ...] = ()
     observation: SoilObservation | None = None
     travel: Travel | None = None
-    pose: Pose = field(default_factory=Pose)
+    pose: Pose = Pose()
     settled: bool = True
     arrived: bool = True
-    held: Mapping[str, str] = field(default_factory=dict)
+    held: Mapping[str, str] = NOTHING_HELD
     devices_active: bool = False
     arm_error: str = ""
     unmet: tuple[Unmet, ...] = ()
@@ -147,7 +149,7 @@ def step(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSett
         state, reply = _obey(state, command, inputs, settings)
         replies.append(reply)
     if state.goals != before.goals:  # taken in this tick: not reached yet, and nothing has held them
-        inputs = replace(inputs, settled=False, arrived=False, held={})
+        inputs = inputs._replace(settled=False, arrived=False, held=NOTHING_HELD)
     state = _advance(state, inputs, settings, rule)
     armed = state.mode in ARMED
     return Step(
@@ -322,9 +324,11 @@ def _advance(state: State, inputs: Inputs, settings: MachineSettings, rule: Rule
             if "rotation" in held
             else decide(state.decision, inputs.observation, inputs.settled, inputs.now_s, rule, inputs.travel)
         )
-        state = replace(state, decision=decision, goals=Goals(rotation_deg=decision.angle_deg))
-    if state.mode in ARMED:
-        return replace(state, holding=_why_holding(state, inputs))
+        goals = Goals(rotation_deg=decision.angle_deg)
+        if decision is not state.decision or goals != state.goals:
+            state = replace(state, decision=decision, goals=goals)
+    if state.mode in ARMED and (holding := _why_holding(state, inputs)) != state.holding:
+        return replace(state, holding=holding)
     return state
 
 
@@ -336,6 +340,8 @@ def _counting(state: State, inputs: Inputs) -> list[ActiveFault]:
 def _held(state: State, inputs: Inputs) -> dict[str, str]:
     """Why an axis must stay where it is: a fault that holds it, or the gate that did not let its goal pass."""
     by_part = {part: f"{f.name}: {f.row.reads}" for part, f in held_axes(_counting(state, inputs)).items()}
+    if not by_part:
+        return dict(inputs.held)
     return dict(inputs.held) | {axis: by_part[part] for axis, part in PARTS.items() if part in by_part}
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from pydantic import Field
 
@@ -113,8 +113,7 @@ def motion_figures(rotation: RotatorSettings, figures: Mapping[str, AxisFigures]
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class AxisSample:
+class AxisSample(NamedTuple):
     """What is known of one axis at a tick; position, velocity and goal in its unit.
 
     ``time_s``: when the position was measured. ``velocity``: None where the device gives none; it follows from the

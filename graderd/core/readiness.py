@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
-from graderd.core.axes import UNITS, AxisFigures
+from graderd.core.axes import UNITS, AxisFigures, Pose
 from graderd.core.faults.monitor import ActiveFault, Clear, Reaction
 from graderd.core.machine import Mode, State, Unmet
 from graderd.hal.device import Lifecycle
 
 
-@dataclass(frozen=True, slots=True)
-class Requirement:
+class Requirement(NamedTuple):
     """One line of the readiness list."""
 
     name: str
@@ -26,18 +25,20 @@ class Requirement:
         return Unmet(self.name, self.reason, self.remedy)
 
 
-@dataclass(frozen=True, slots=True)
-class AxisReadiness:
-    """What readiness asks of one axis: its device's lifecycle, why it is not open, where it stands (None: unknown)."""
+class AxisDevice(Protocol):
+    """What readiness asks of one axis's device: its lifecycle, and why it is not open (empty where it is)."""
 
-    lifecycle: Lifecycle
-    problem: str
-    position: float | None
+    @property
+    def lifecycle(self) -> Lifecycle: ...
+
+    @property
+    def problem(self) -> str: ...
 
 
 def requirements(
     state: State,
-    axes: Mapping[str, AxisReadiness],
+    axes: Mapping[str, AxisDevice],
+    pose: Pose,
     figures: Mapping[str, AxisFigures],
     faults: Sequence[ActiveFault],
 ) -> tuple[Requirement, ...]:
@@ -45,7 +46,7 @@ def requirements(
     found = [_not_stopped(state)]
     for name, axis in axes.items():
         found.append(_connected(name, axis, faults))
-        found.append(_inside_limits(name, axis.position, figures[name]))
+        found.append(_inside_limits(name, pose[name], figures[name]))
     blocking = [f for f in faults if f.present and _blocks(f)]
     found += [Requirement(f.name, False, True, f.detail or f.row.reads, f.row.remedy) for f in blocking]
     camera = [f for f in faults if f.name.startswith("camera.") and f.present]
@@ -73,15 +74,15 @@ def _not_stopped(state: State) -> Requirement:
     return Requirement("stop", not stopped, True, reason, "graderd reset" if stopped else "")
 
 
-def _connected(name: str, axis: AxisReadiness, faults: Sequence[ActiveFault]) -> Requirement:
+def _connected(name: str, axis: AxisDevice, faults: Sequence[ActiveFault]) -> Requirement:
     if axis.lifecycle in (Lifecycle.STANDBY, Lifecycle.ACTIVE):
-        return Requirement(name, True, True, f"{axis.lifecycle}", "")
+        return Requirement(name, True, True, axis.lifecycle.value, "")
     why = axis.problem or next((f.detail for f in faults if f.name.startswith(f"{name}.")), "")
     return Requirement(
         name,
         False,
         True,
-        f"{axis.lifecycle}{': ' + why if why else ''}",
+        f"{axis.lifecycle.value}{': ' + why if why else ''}",
         f"check power, cable and the [{name}] section",
     )
 

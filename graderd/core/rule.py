@@ -9,6 +9,7 @@ carries spreads along it, whatever was decided, and would undo the decision. See
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from pydantic import Field, model_validator
@@ -110,6 +111,9 @@ class Decision:
         return f"{self.zone}, kept for this pass since {since}" if self.begun else f"{self.zone}, before the pass"
 
 
+Agreeing = Mapping[Zone, Sequence[SoilObservation]]
+
+
 def decide(
     decision: Decision,
     observation: SoilObservation | None,
@@ -124,10 +128,13 @@ def decide(
     soil are moving against each other. ``travel`` None: the machine does not say how it drives.
     """
     votes = _votes(decision.votes, observation, now_s, rule) if settled else ()
-    decision = _pass(replace(decision, votes=votes), now_s, rule, travel)
-    if now_s - decision.decided_s < rule.dwell_s:
+    if votes != decision.votes:
+        decision = replace(decision, votes=votes)
+    agreeing = _agreeing(votes, rule)
+    decision = _pass(decision, agreeing, now_s, rule, travel)
+    if now_s - decision.decided_s < rule.dwell_s or not decision.votes:
         return decision
-    winner = _winner(decision, rule)
+    winner = _winner(decision, agreeing, rule)
     if winner is None or (winner is decision.zone and decision.kept):
         return decision
     drives = travel is None or abs(travel.speed_m_per_s) >= rule.standing_m_per_s
@@ -151,13 +158,13 @@ def _votes(
     return kept
 
 
-def _pass(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel | None) -> Decision:
+def _pass(decision: Decision, agreeing: Agreeing, now_s: float, rule: RuleSettings, travel: Travel | None) -> Decision:
     """Follow the pass that the decision is kept for, and end it where it ends."""
     if not decision.kept:
         return decision
     decision = _driven(decision, now_s, rule, travel)
     stood_s = 0.0 if decision.standing_since_s is None else now_s - decision.standing_since_s
-    ended, gone = "", _agreeing(decision.votes, rule, Zone.NONE)
+    ended, gone = "", agreeing.get(Zone.NONE, ())
     if travel is not None and travel.speed_m_per_s <= -rule.standing_m_per_s:
         ended = "the machine reversed"
     elif decision.begun and stood_s >= rule.standing_s:
@@ -175,6 +182,8 @@ def _pass(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel |
 def _driven(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel | None) -> Decision:
     if travel is None:
         # Not said any more, or never: kept, since it may drive; from here on the time counts.
+        if decision.begun and decision.since_m is None and decision.standing_since_s is None:
+            return decision
         return replace(decision, begun=True, at_m=None, since_m=None, standing_since_s=None)
     at_m = travel.travelled_m if decision.at_m is None else decision.at_m
     since_m = travel.travelled_m - at_m
@@ -189,15 +198,15 @@ def _driven(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel
     )
 
 
-def _winner(decision: Decision, rule: RuleSettings) -> Zone | None:
+def _winner(decision: Decision, agreeing: Agreeing, rule: RuleSettings) -> Zone | None:
     for zone in TURNING_ZONES:
-        agreeing = _agreeing(decision.votes, rule, zone)
-        if agreeing and (not decision.kept or zone is decision.zone or _may_follow(decision, zone, agreeing, rule)):
+        votes = agreeing.get(zone)
+        if votes and (not decision.kept or zone is decision.zone or _may_follow(decision, zone, votes, rule)):
             return zone
     return None
 
 
-def _may_follow(decision: Decision, zone: Zone, agreeing: list[SoilObservation], rule: RuleSettings) -> bool:
+def _may_follow(decision: Decision, zone: Zone, agreeing: Sequence[SoilObservation], rule: RuleSettings) -> bool:
     """Whether ``zone`` may take the place of a decision in the pass that this was taken for.
 
     Even is a job of its own, flattening: it follows on scattering where what *comes* lies evenly, once.
@@ -209,7 +218,11 @@ def _may_follow(decision: Decision, zone: Zone, agreeing: list[SoilObservation],
     )
 
 
-def _agreeing(votes: tuple[SoilObservation, ...], rule: RuleSettings, zone: Zone) -> list[SoilObservation]:
-    """The sure votes for what comes, where they are enough."""
-    sure = [v for v in votes if v.coming.zone is zone and v.coming.confidence >= rule.min_confidence]
-    return sure if len(sure) >= rule.votes_needed_n else []
+def _agreeing(votes: tuple[SoilObservation, ...], rule: RuleSettings) -> Agreeing:
+    """The sure votes for what comes, by zone, where they are enough."""
+    sure: dict[Zone, list[SoilObservation]] = {}
+    for vote in votes:
+        coming = vote.coming
+        if coming.confidence >= rule.min_confidence:
+            sure.setdefault(coming.zone, []).append(vote)
+    return {zone: of for zone, of in sure.items() if len(of) >= rule.votes_needed_n}

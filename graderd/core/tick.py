@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import NamedTuple
 
 from graderd.core import commands as cmd
 from graderd.core.attitude import AttitudeGeometry, MeasuredAttitude, Preset, measured_attitude
@@ -21,7 +22,7 @@ from graderd.core.lift_pair import LiftCoordinator, LiftPairSettings, SideReadin
 from graderd.core.machine import ARMED, Inputs, Intents, MachineSettings, Mode, State, step
 from graderd.core.motion import resolve
 from graderd.core.plausibility import AxisSample, MotionFigures, PlausibilityMonitor, axis_sample
-from graderd.core.readiness import AxisReadiness, Requirement, requirements
+from graderd.core.readiness import Requirement, requirements
 from graderd.core.rule import RuleSettings, Travel
 from graderd.core.soil import SoilObservation
 from graderd.hal.device import Lifecycle
@@ -34,6 +35,7 @@ from graderd.hal.vehicle import VehicleTelemetry
 BLOCKED_S = 0.5
 """A tick this late: goals have timed out and the servo's watchdog (0.2 s by default) has tripped meanwhile."""
 LAPSE_SHOWN_S = 3.0
+NO_VEHICLE = VehicleTelemetry()
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +89,10 @@ class Sensed:
     arm_error: str = ""
     refused: Mapping[str, str] = field(default_factory=dict)
     late_s: float = 0.0
-    vehicle: VehicleTelemetry = field(default_factory=VehicleTelemetry)
+    vehicle: VehicleTelemetry = NO_VEHICLE
 
 
-@dataclass(frozen=True, slots=True)
-class AxisTick:
+class AxisTick(NamedTuple):
     """What became of one axis in this tick, in its unit.
 
     ``requested``: where it was asked to go, None: nowhere. ``limited``: what the gate passed, None: it holds;
@@ -111,8 +112,7 @@ class AxisTick:
     arrived: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
+class Tick(NamedTuple):
     """Everything one tick decided.
 
     ``replies``: to the commands of ``Sensed``, in their order. ``stopped_now``: the stop was latched in this tick.
@@ -237,15 +237,21 @@ class Controller:
             ),
             lambda goals: self._lift.step(goals, sensed.now_s, left, right),
         )
+        shares = self._lift.shares
         former, self._sending = (
             self._sending,
             frozenset(axis for axis, result in passed.items() if result.limited is not None and sensed.powered),
         )
         return MappingProxyType(
-            {axis: self._axis(axis, result, sensed, pose[axis], axis in former) for axis, result in passed.items()}
+            {
+                axis: self._axis(axis, result, sensed, pose[axis], axis in former, shares.get(axis, 1.0))
+                for axis, result in passed.items()
+            }
         )
 
-    def _axis(self, axis: str, passed: AxisPass, sensed: Sensed, position: float | None, moving: bool) -> AxisTick:
+    def _axis(
+        self, axis: str, passed: AxisPass, sensed: Sensed, position: float | None, moving: bool, share: float
+    ) -> AxisTick:
         sending = axis in self._sending
         requested, refused = self._state.goals[axis], sensed.refused.get(axis, "")
         stopped = self._lift.stopped if axis in LIFTS else ""
@@ -258,7 +264,7 @@ class Controller:
             send=passed.limited if sending else None,
             # Once: a hold renewed every tick would follow every bit of measured drift.
             hold=moving and not sending,
-            speed_share=self._lift.shares.get(axis, 1.0),
+            speed_share=share,
             arrived=requested is not None and position is not None and abs(position - requested) <= tolerance,
         )
 
@@ -292,11 +298,10 @@ class Controller:
 
     def _present(self, sensed: Sensed) -> list[DeviceFault]:
         implausible = self._plausibility.judge(_samples(sensed), sensed.now_s)
-        return [*sensed.faults, *implausible, *self._lift.faults(), *self._own_faults.present(sensed.now_s)]
+        return [*sensed.faults, *implausible, *self._lift.faults(sensed.now_s), *self._own_faults.present(sensed.now_s)]
 
     def _readiness(self, sensed: Sensed, pose: Pose) -> tuple[Requirement, ...]:
-        axes = {name: AxisReadiness(axis.lifecycle, axis.problem, pose[name]) for name, axis in sensed.axes.items()}
-        return requirements(self._state, axes, self._settings.figures, self._faults.active)
+        return requirements(self._state, sensed.axes, pose, self._settings.figures, self._faults.active)
 
     def _note_late(self, late_s: float, now_s: float) -> None:
         if late_s <= self._settings.overrun_s:
@@ -324,12 +329,8 @@ def _unlatching(state: State, commands: tuple[cmd.AnyCommand, ...]) -> Clear | N
 
 def _pose_of(sensed: Sensed, figures: Mapping[str, AxisFigures]) -> Pose:
     """Measured positions fresh enough to act on."""
-    return Pose.of(
-        **{
-            axis: _fresh(told.telemetry.position, sensed.now_s, figures[axis].max_age_s)
-            for axis, told in sensed.axes.items()
-        }
-    )
+    axes, now_s = sensed.axes, sensed.now_s
+    return Pose(*(_fresh(axes[axis].telemetry.position, now_s, figures[axis].max_age_s) for axis in AXES))
 
 
 def _fresh(reading: Reading[float] | None, now_s: float, max_age_s: float) -> float | None:

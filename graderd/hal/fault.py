@@ -48,6 +48,8 @@ class PresentFaults:
 
     def present(self, now_s: float) -> tuple[DeviceFault, ...]:
         """All that are present now, oldest first."""
+        if not self._entries:
+            return ()
         shown = (fault for fault, until_s in self._entries.values() if now_s <= until_s)
         return tuple(sorted(shown, key=lambda f: f.since_s))
 

@@ -27,7 +27,7 @@ class Reading(Generic[T_co]):
 
     def is_fresh(self, now_s: float, max_age_s: float) -> bool:
         """Whether the value is valid and at most ``max_age_s`` old."""
-        return self.valid and self.age_s(now_s) <= max_age_s
+        return self.valid and now_s - self.time_s <= max_age_s
 
     def fresh(self, now_s: float, max_age_s: float) -> T_co:
         """The value, if valid and at most ``max_age_s`` old.

@@ -14,11 +14,10 @@ from graderd.core.attitude import MeasuredAttitude
 from graderd.core.machine import ARMED, Mode, State
 from graderd.core.plausibility import motion_figures
 from graderd.core.soil import SoilObservation
-from graderd.core.tick import AxisSensed, AxisTick, Controller, Sensed, Tick, TickSettings
+from graderd.core.tick import NO_VEHICLE, AxisSensed, AxisTick, Controller, Sensed, Tick, TickSettings
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceError
 from graderd.hal.fault import DeviceFault
-from graderd.hal.vehicle import VehicleTelemetry
 from graderd.runtime.devices import Devices, PowerSequencer
 from graderd.runtime.state_file import LastStop, StateFile
 
@@ -72,7 +71,8 @@ def _state_at_start(last_stop: LastStop | None) -> State:
 
 
 class ControlLoop:
-    """One per daemon. ``sensed`` and ``tick`` are the newest: whoever wants to know something reads them.
+    """One per daemon. ``sensed`` and ``tick`` are the newest: whoever wants to know something reads them. ``figures``:
+    those of every axis.
 
     ``fault_sources``: told the time, each says what it sees wrong now. ``on_tick``: called at the end of every tick.
     """
@@ -90,7 +90,9 @@ class ControlLoop:
         self.fault_sources: list[Callable[[float], tuple[DeviceFault, ...]]] = []
         self.on_tick: Callable[[], None] | None = None
         self._period_s = 1.0 / config.control.tick_hz
-        self._controller = Controller(tick_settings(config), _state_at_start(self.last_stop))
+        settings = tick_settings(config)
+        self.figures = settings.figures
+        self._controller = Controller(settings, _state_at_start(self.last_stop))
         self._devices = devices
         self._eyes = eyes
         self._clock = clock
@@ -205,7 +207,7 @@ class ControlLoop:
             arm_error=self._power.take_error(),
             refused=refused,
             late_s=late_s,
-            vehicle=self._devices.vehicle.telemetry() if self._devices.vehicle else VehicleTelemetry(),
+            vehicle=self._devices.vehicle.telemetry() if self._devices.vehicle else NO_VEHICLE,
         )
 
     def _act(self, tick: Tick) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from functools import lru_cache
 from importlib.metadata import version
 from typing import Any, Protocol, TypeVar
 
 from graderd.config import Config
 from graderd.core.axes import UNITS
+from graderd.core.readiness import Requirement
 from graderd.core.soil import SoilAhead, SoilObservation, Thirds
 from graderd.core.status import (
     AheadStatus,
@@ -43,7 +45,6 @@ def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) 
     tick, sensed = loop.tick, loop.sensed
     now_s, state, decision = tick.now_s, tick.state, tick.state.decision
     lateness = sorted(loop.lateness_s)
-    figures = config.figures()
     return Status(
         time_s=now_s,
         wall_time=datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -66,7 +67,7 @@ def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) 
         ),
         vehicle=_vehicle(sensed.vehicle, now_s),
         axes={
-            name: _axis(name, told, tick.axes[name], now_s, figures[name].max_age_s)
+            name: _axis(name, told, tick.axes[name], now_s, loop.figures[name].max_age_s)
             for name, told in sensed.axes.items()
         },
         attitude=AttitudeStatus(
@@ -85,10 +86,7 @@ def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) 
             )
             for f in tick.faults
         ),
-        readiness=tuple(
-            RequirementStatus(name=r.name, met=r.met, mandatory=r.mandatory, reason=r.reason, remedy=r.remedy)
-            for r in tick.readiness
-        ),
+        readiness=tuple(_requirement(r) for r in tick.readiness),
         lease=LeaseStatus(client=state.lease.client, remaining_s=max(0.0, state.lease.expires_s - now_s))
         if state.lease
         else None,
@@ -100,6 +98,12 @@ def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) 
         ),
         presets=tuple(config.presets),
     )
+
+
+@lru_cache(maxsize=64)
+def _requirement(told: Requirement) -> RequirementStatus:
+    """Most are the same from tick to tick."""
+    return RequirementStatus(**told._asdict())
 
 
 def _soil(newest: SoilObservation | None, frames_per_s: float, now_s: float) -> SoilStatus:

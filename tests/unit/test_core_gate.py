@@ -29,7 +29,7 @@ FIELDS = {"rotation": "rotation_deg", "lift_left": "lift_left_mm", "lift_right":
 
 
 def inputs(**changes: object) -> GateInputs:
-    return replace(GateInputs(SETTINGS, FIGURES, Mode.MANUAL, POSE, DT_S, lease_ok=True, height_mm=0.0), **changes)  # type: ignore[arg-type]
+    return GateInputs(SETTINGS, FIGURES, Mode.MANUAL, POSE, DT_S, lease_ok=True, height_mm=0.0)._replace(**changes)  # type: ignore[arg-type]
 
 
 def goal(axis: str, value: float) -> Goals:
@@ -47,7 +47,7 @@ def drive(goals: Goals, given_inputs: GateInputs, ticks_n: int, follow: bool = T
             for axis, field in FIELDS.items():
                 if passed[axis].limited is not None:
                     pose = replace(pose, **{field: passed[axis].limited})
-            given_inputs = replace(given_inputs, pose=pose)
+            given_inputs = given_inputs._replace(pose=pose)
     return seen
 
 

@@ -165,7 +165,7 @@ def gate_answers() -> Iterator[tuple[str, Any]]:
             )
             if tick < 12 or tick % 12 == 0:
                 rows.append([[p.requested, p.limited, p.reason] for p in passed.values()])
-                rows.append([list(asdict(s).values()) for s in state.setpoints.values()])
+                rows.append([list(s) for s in state.setpoints.values()])
         pose = Pose(5.0, 100.0, 110.0, 50.0)
         yield f"{name}, {mode}, lease {lease_ok}", plain(rows)
 
@@ -188,18 +188,18 @@ def late_answers() -> Iterator[tuple[str, Any]]:
         state = GateState({"rotation": Setpoint(0.0, speed, 0.0)})
         state, _ = pass_gate(state, Goals(way_deg), GateInputs(GATE, FIGURES, Mode.MANUAL, pose, dt_s, True))
         # ending at the goal and passing it are told apart by the speed that is left
-        yield f"{share} of the way to stop from {speed}, {dt_s}", plain(asdict(state.setpoints["rotation"]))
+        yield f"{share} of the way to stop from {speed}, {dt_s}", plain(state.setpoints["rotation"]._asdict())
     for goal_deg, dt_s in product((70.0, -70.0, 60.0), (0.01, 0.02, 0.2)):
         near, speed = math.copysign(59.9, goal_deg), math.copysign(limits.speed, goal_deg)
         state = GateState({"rotation": Setpoint(near, speed, near)})
         there = Pose(near, 100.0, 100.0, 50.0)
         state, _ = pass_gate(state, Goals(goal_deg), GateInputs(GATE, FIGURES, Mode.MANUAL, there, dt_s, True))
-        yield f"fast at the limit, to {goal_deg}, {dt_s}", plain(asdict(state.setpoints["rotation"]))
+        yield f"fast at the limit, to {goal_deg}, {dt_s}", plain(state.setpoints["rotation"]._asdict())
     for part, dt_s in product((0.99, 1.01, 1.05, 1.2), (0.2, 0.5, 1.0)):
         state = GateState({"rotation": Setpoint(0.0, limits.speed, 0.0)})
         goals = Goals(part * limits.speed * dt_s)
         state, _ = pass_gate(state, goals, GateInputs(GATE, FIGURES, Mode.MANUAL, pose, dt_s, True))
-        yield f"{part} of a tick's way in {dt_s}", plain(asdict(state.setpoints["rotation"]))
+        yield f"{part} of a tick's way in {dt_s}", plain(state.setpoints["rotation"]._asdict())
 
 
 def bound_answers() -> Iterator[tuple[str, Any]]:

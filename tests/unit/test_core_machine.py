@@ -32,7 +32,7 @@ def resolve(command: cmd.Jog | cmd.Preset, pose: Pose) -> tuple[Goals, ...] | st
 
 def inputs(*commands: cmd.Command, now_s: float = NOW_S, **changes: Any) -> Inputs:
     base = Inputs(now_s=now_s, resolve=resolve, commands=commands, pose=POSE)
-    return replace(base, **changes)
+    return base._replace(**changes)
 
 
 def fault(reaction: Reaction, axes: Set[str] = ALL_AXES, name: str = "camera.test") -> ActiveFault:

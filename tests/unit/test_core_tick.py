@@ -136,6 +136,8 @@ def _plain(value: Any) -> Any:
         return round(value, 9) if math.isfinite(value) else str(value)
     if is_dataclass(value) and not isinstance(value, type):
         return _plain(asdict(value))
+    if hasattr(value, "_asdict"):
+        return _plain(value._asdict())
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
@@ -163,9 +165,10 @@ def test_the_recorded_stretch_has_everything_in_it() -> None:
     assert any("soft limit" in tick.axes["rotation"].because for tick in ticks)
 
 
-def test_writing_sensed_down_and_reading_it_loses_nothing() -> None:
+@pytest.mark.parametrize("exclude_none", [False, True])
+def test_writing_sensed_down_and_reading_it_loses_nothing(exclude_none: bool) -> None:
     recorded = stretch_of_work()
-    again = RECORDED.validate_json(RECORDED.dump_json(recorded))
+    again = RECORDED.validate_json(RECORDED.dump_json(recorded, exclude_none=exclude_none))
     assert again == recorded
     assert [told(tick) for tick in run(again)] == [told(tick) for tick in run(recorded)]
 
@@ -354,7 +357,7 @@ def main() -> None:
     """Write the golden file anew."""
     recorded = stretch_of_work()
     golden = {
-        "sensed": RECORDED.dump_python(recorded, mode="json"),
+        "sensed": RECORDED.dump_python(recorded, mode="json", exclude_none=True),
         "ticks": [told(t) for t in run(recorded)[::KEPT_EVERY_N]],
     }
     GOLDEN.write_text(json.dumps(golden, separators=(",", ":")) + "\n", encoding="utf-8")

@@ -11,7 +11,7 @@ import copy
 import math
 import os
 import random
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import pytest
 
@@ -429,6 +429,6 @@ def test_the_monitor_sees_a_goal_led_too_far() -> None:
     axis = tick.axes["rotation"]
     assert axis.send is not None
     for offset, said in ((30.0, "led too far"),):
-        changed = replace(tick, axes={**tick.axes, "rotation": replace(axis, send=axis.send + offset)})
+        changed = tick._replace(axes={**tick.axes, "rotation": axis._replace(send=axis.send + offset)})
         with pytest.raises(AssertionError, match=said):
             copy.deepcopy(monitor).judge(sensed, changed)
