@@ -57,9 +57,14 @@ T = TypeVar("T")
 
 STOP_SUFFIX: Final = ".stop"
 """Beside the interface's socket ``graderd.sock``, ``graderd.stop`` serves nothing but stop."""
+STOP_PATH: Final = "/v1/stop"
+STOP_LANE_S: Final = 0.5
+"""On TCP the port after the interface's serves nothing but stop (``api.tcp.stop_port_n`` may name another). Where it
+does not answer in so long, the interface is asked."""
 TIMEOUT_S: Final = 5.0
 SERVICE_TIMEOUT_S: Final = 120.0
 LEASE_HZ: Final = 10.0
+RENEWAL: Final = '{"command": "renew"}'
 """How often a lease is renewed, and how often its holder sees a status: three times within the 0.3 s that it lasts."""
 BUSY_RETRY_S: Final = 3.0
 RETRY_PAUSE_S: Final = 0.02
@@ -278,7 +283,7 @@ class Client:
 
     def stop(self, reason: str = "stop request") -> Reply:
         """End motion at once and latch. Wins over everything; repeated by itself until it is answered."""
-        return _reply_of(self.post("/v1/stop", _stop_body(self.name, reason)))
+        return _reply_of(self.post(STOP_PATH, _stop_body(self.name, reason)))
 
     def command(self, command: str, **fields: Any) -> Reply:
         """One command (``arm``, ``disarm``, ``auto``, ``manual``…): see docs/integrators/api.md.
@@ -304,6 +309,22 @@ class Client:
         found: dict[str, Any] = self.post(f"/v1/services/{quote(name)}", arguments, timeout_s)
         return found
 
+    def maneuver(self, name: str, timeout_s: float = SERVICE_TIMEOUT_S, **arguments: Any) -> dict[str, Any]:
+        """Run a service that moves the blade, such as ``rotation.step_response``, and return what it found. It ends,
+        and the blade holds, when this program ends or stands still.
+
+        Raises:
+            RefusedError: refused, failed, or ended under way.
+        """
+        give_up_s = time.monotonic() + timeout_s
+        with self._websocket(f"/v1/services/{quote(name)}") as connection:
+            connection.send(json.dumps(arguments, allow_nan=False))
+            while time.monotonic() < give_up_s:
+                with suppress(TimeoutError):
+                    return _result_of(name, connection.recv(1.0 / LEASE_HZ))
+                connection.send(RENEWAL)
+        raise self._address.unreachable(TimeoutError(), went_out=True)
+
     @contextmanager
     def lease(self, name: str = "", rate_hz: float = LEASE_HZ) -> Iterator[Lease]:
         """Move by hand for as long as the block lasts: see :class:`Lease`. ``name`` is added to the client's."""
@@ -328,16 +349,24 @@ class Client:
     ) -> bytes:
         payload = None if body is None else json.dumps(body, allow_nan=False)
         give_up_s = time.monotonic() + BUSY_RETRY_S
+        stop_lane = path == STOP_PATH
         while True:
-            connection = self._address.http_connection(timeout_s or self.timeout_s, path)
+            connection = self._address.http_connection(timeout_s or self.timeout_s, stop_lane)
             went_out = False
             try:
                 connection.connect()
                 went_out = True
                 connection.request(method, path, payload, self._address.headers(with_body=payload is not None))
                 answer = connection.getresponse()
-                return self._address.checked(answer.status, answer.read())
+                content = answer.read()
+                if not stop_lane or answer.status == http.HTTPStatus.OK:
+                    return self._address.checked(answer.status, content)
+                stop_lane = False  # it is not what we took it for: a stop may be asked for twice
+                continue
             except (OSError, http.client.HTTPException) as error:
+                if stop_lane:
+                    stop_lane = False
+                    continue
                 again = _may_repeat(error, method, path) if went_out else _is_full(error)
                 if not again or time.monotonic() > give_up_s:
                     raise self._address.unreachable(error, went_out) from error
@@ -357,6 +386,7 @@ class Client:
                 sock=None if address.path is None else _connect_unix(address.path, self.timeout_s),
                 additional_headers=address.headers(),
                 compression=None,
+                max_size=None,
                 proxy=None,
                 open_timeout=self.timeout_s,
                 # Pins what the call returns: a connection, whatever the library's default becomes.
@@ -554,6 +584,19 @@ class AsyncClient:
         """See :meth:`Client.service`."""
         return await _in_thread(lambda: self._waiting.service(name, timeout_s, **arguments))
 
+    async def maneuver(self, name: str, timeout_s: float = SERVICE_TIMEOUT_S, **arguments: Any) -> dict[str, Any]:
+        """See :meth:`Client.maneuver`; it ends, too, when this is cancelled."""
+        try:
+            async with asyncio.timeout(timeout_s), self._websocket(f"/v1/services/{quote(name)}") as connection:
+                await connection.send(json.dumps(arguments, allow_nan=False))
+                while True:
+                    with suppress(TimeoutError):
+                        async with asyncio.timeout(1.0 / LEASE_HZ):
+                            return _result_of(name, await connection.recv())
+                    await connection.send(RENEWAL)
+        except TimeoutError as error:
+            raise self._address.unreachable(error, went_out=True) from error
+
     @asynccontextmanager
     async def lease(self, name: str = "", rate_hz: float = LEASE_HZ) -> AsyncIterator[AsyncLease]:
         """See :meth:`Client.lease`."""
@@ -584,6 +627,7 @@ class AsyncClient:
                 address.websocket_uri(path, query),
                 additional_headers=address.headers(),
                 compression=None,
+                max_size=None,
                 proxy=None,
                 open_timeout=self.timeout_s,
                 **where,
@@ -695,11 +739,14 @@ class _Address:
     def websocket_uri(self, path: str, query: Mapping[str, str | float]) -> str:
         return f"ws://{self.netloc}{path}{'?' if query else ''}{urlencode(query)}"
 
-    def http_connection(self, timeout_s: float, for_path: str = "") -> http.client.HTTPConnection:
+    def http_connection(self, timeout_s: float, stop_lane: bool = False) -> http.client.HTTPConnection:
+        """``stop_lane``: where stop alone is served, and nobody else waits; an older daemon has none."""
         if self.path is None:
+            if stop_lane and 0 < self.port_n < 65535:
+                return http.client.HTTPConnection(self.host, self.port_n + 1, timeout=min(timeout_s, STOP_LANE_S))
             return http.client.HTTPConnection(self.host, self.port_n, timeout=timeout_s)
         stop_socket = self.path.with_suffix(STOP_SUFFIX)
-        if for_path == "/v1/stop" and _is_socket(stop_socket):  # where nobody else waits; an older daemon has none
+        if stop_lane and _is_socket(stop_socket):
             return _UnixConnection(stop_socket, timeout_s)
         return _UnixConnection(self.path, timeout_s)
 
@@ -896,7 +943,7 @@ def _may_repeat(error: BaseException, method: str, path: str) -> bool:
     """Whether a request that went out and was dropped (a flooded daemon makes room) may go out again: a question and a
     stop may. A reset may not: somebody may have stopped the machine in between."""
     dropped = isinstance(error, ConnectionResetError | BrokenPipeError | http.client.RemoteDisconnected)
-    return dropped and (method == "GET" or path == "/v1/stop")
+    return dropped and (method == "GET" or path == STOP_PATH)
 
 
 def _may_pass(error: ClientError) -> bool:
@@ -916,6 +963,19 @@ def _reply_of(found: Any) -> Reply:
     from graderd.core.commands import Reply
 
     return Reply.model_validate(found)
+
+
+def _result_of(name: str, text: str | bytes) -> dict[str, Any]:
+    """A maneuver's last word.
+
+    Raises:
+        RefusedError: a problem.
+    """
+    answer = json.loads(text)
+    if "result" not in answer:
+        raise RefusedError(answer.get("where") or name, answer.get("error", ""), answer.get("remedy", ""))
+    found: dict[str, Any] = answer["result"]
+    return found
 
 
 def _check_reply(command: str, answer: dict[str, Any]) -> None:

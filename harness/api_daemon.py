@@ -71,6 +71,7 @@ class FakeDaemon:
     held: dict[str, FaultStatus] = field(default_factory=dict)
     bus_watched_n: int = 0
     maneuvers: list[str] = field(default_factory=list)
+    maneuver_done: asyncio.Event = field(default_factory=asyncio.Event)
     state: State = field(default_factory=State)
     torque_on: bool | None = None
     positions: dict[str, float] = field(
@@ -148,7 +149,8 @@ class FakeDaemon:
         if name == "rotation.step_response":
             self.maneuvers.append("began")
             try:
-                await asyncio.Event().wait()
+                await self.maneuver_done.wait()
+                return {"overshoot_percent": 1.5}
             finally:
                 self.maneuvers.append("ended")
         raise ServiceError(f"there is no service {name}", "see /v1/openapi.json")

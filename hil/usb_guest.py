@@ -12,12 +12,14 @@ import json
 import os
 import platform
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
+from graderd.client import ClientError, Lease
 from hil.bus import details, interface_exists
 from hil.service import PYTHON, Grader, Unit, brief, faults, run, wait_for
 
@@ -54,6 +56,7 @@ SETTINGS: Final[dict[str, object]] = {
     "camera.restart_s": 600.0,
     "can.channel": OURS,
 }
+RENEW_S: Final = 0.1
 TIMEOUT_S: Final = 180.0
 TOLD_S: Final = 5.0
 
@@ -129,13 +132,28 @@ def ready(grader: Grader) -> None:
     )
 
 
-def turning(grader: Grader, goal_deg: float) -> float:
-    """Arm, jog towards the goal, return the angle while it turns."""
+@contextmanager
+def turning(grader: Grader, goal_deg: float) -> Iterator[float]:
+    """Arm and jog towards the goal, with the key held down while the block lasts; yields an angle under way."""
     grader.arm("manual")
     start = grader.status()["axes"]["rotation"]["measured"]
-    grader.client.command("jog", axis="rotate", value=goal_deg)
-    state = grader.wait("turning", lambda s: abs(s["axes"]["rotation"]["measured"] - start) > 1.0, 30.0)
-    return float(state["axes"]["rotation"]["measured"])
+    let_go = threading.Event()
+
+    def hold_down(lease: Lease) -> None:
+        with suppress(ClientError):  # the machine has ended it
+            while not let_go.wait(RENEW_S):
+                lease.renew()
+
+    with grader.client.lease() as lease:
+        lease.jog("rotate", goal_deg)
+        key = threading.Thread(target=hold_down, args=(lease,), name="key")
+        key.start()
+        try:
+            state = grader.wait("turning", lambda s: abs(s["axes"]["rotation"]["measured"] - start) > 1.0, 30.0)
+            yield float(state["axes"]["rotation"]["measured"])
+        finally:
+            let_go.set()
+            key.join()
 
 
 def set_up() -> None:
@@ -183,10 +201,10 @@ def main() -> int:
         }, found
     pid = grader.unit.pid
     with report.step("the adapter is pulled while the blade turns: told, disarmed, the service stays") as found:
-        found["at_deg"] = turning(grader, 30.0)
-        host("unplug")
-        found["told_s"] = within("told", grader, lambda s: "rotation.unplugged" in faults(s), TOLD_S)
-        grader.wait("disarmed", lambda s: s["mode"] == "disarmed", TOLD_S)
+        with turning(grader, 30.0) as found["at_deg"]:
+            host("unplug")
+            found["told_s"] = within("told", grader, lambda s: "rotation.unplugged" in faults(s), TOLD_S)
+            grader.wait("disarmed", lambda s: s["mode"] == "disarmed", TOLD_S)
         wait_for("the name to go", lambda: not SERVO.exists(), 10.0)
     with report.step("plugged in again: same name, same latency, nothing moves, armed and turned again") as found:
         host("plug")
@@ -202,7 +220,8 @@ def main() -> int:
         assert before < 25.0, "it stopped on the way, for the servo's own watchdog ended the motion"
         found["stands_at_deg"] = after
         ready(grader)
-        turning(grader, 0.0)
+        with turning(grader, 0.0):
+            pass
         grader.disarm()
         assert grader.unit.pid == pid
     device = Path(f"/sys/class/net/{OURS}/device").resolve()

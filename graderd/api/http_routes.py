@@ -8,7 +8,7 @@ from collections.abc import Coroutine
 from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Body, Path, Request, Response
-from pydantic import Field, StrictBool, create_model
+from pydantic import BaseModel, Field, StrictBool, create_model
 from starlette.requests import HTTPConnection
 
 from graderd.api.port import DaemonPort, ServiceError
@@ -42,7 +42,10 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
 
 
 NEEDS_CONSENT = """Wants `consent: true`, a disarmed machine, and no other such service under way."""
-ENDS_WITH_CLIENT = """ It ends, and the blade holds, when the connection that asked for it ends."""
+NEEDS_UPGRADE = """ It moves the blade for as long as it runs, so it is a WebSocket of the same path: the first message
+is this body, every further one renews the lease, the last that comes is `{"result": ...}` or a `Problem`. It ends, and
+the blade holds, when the connection ends or is silent for half a second."""
+UPGRADE = "open it as a WebSocket, or use the client or 'graderd'"
 T = TypeVar("T")
 NAMES_N = 1000
 """More than connections can be open."""
@@ -140,15 +143,22 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: 
     return router
 
 
-def _add_service(router: APIRouter, port: DaemonPort, name: str, offered: DeviceService) -> None:
-    """The route of one service, with its arguments as it describes them."""
+def service_request(name: str, offered: DeviceService) -> type[BaseModel]:
+    """What a request for a service holds: its arguments, and consent where it may move or unpower something."""
     consent: Any = (StrictBool, Field(False, description="somebody has looked and nobody is near the blade"))
     fields = {} if offered.only_reads else {"consent": consent}
-    model = create_model(
+    return create_model(
         f"{name.title().replace('.', '').replace('_', '')}Request", __base__=offered.arguments, **fields
     )
 
+
+def _add_service(router: APIRouter, port: DaemonPort, name: str, offered: DeviceService) -> None:
+    """The route of one service, with its arguments as it describes them."""
+    model = service_request(name, offered)
+
     async def service(request: Request, arguments: Any = None) -> dict[str, Any]:
+        if offered.moves:
+            raise ProblemError(426, f"{name} moves the blade for as long as its client renews", name, UPGRADE)
         given = {} if arguments is None else arguments.model_dump(exclude_unset=True)
         return await _while_connected(request, _served(port, name, given))
 
@@ -157,8 +167,10 @@ def _add_service(router: APIRouter, port: DaemonPort, name: str, offered: Device
         "arguments": Annotated[model | None, Body()],
         "return": dict[str, Any],
     }
-    service.__doc__ = "" if offered.only_reads else NEEDS_CONSENT + ENDS_WITH_CLIENT * offered.moves
+    service.__doc__ = "" if offered.only_reads else NEEDS_CONSENT + NEEDS_UPGRADE * offered.moves
     responses: dict[int | str, dict[str, Any]] = {number: PROBLEMS[number] for number in (409, 422, 503)}
+    if offered.moves:
+        responses[426] = {"model": Problem, "description": "asked for without a WebSocket upgrade"}
     router.add_api_route(
         f"/services/{name}",
         service,

@@ -63,6 +63,9 @@ class ApiLimits(Settings):
     stop_rate_hz: Positive = Field(
         100.0, ge=10, le=10_000, description="stop requests served per second, whatever else is going on"
     )
+    maneuver_lease_s: Positive = Field(
+        0.5, ge=0.1, le=5, description="a client silent for so long moves nothing by a service; slow emulators need 5 s"
+    )
     services_n: int = Field(2, ge=1, description="device services running at the same time")
     command_timeout_s: Positive = Field(
         2.0, le=10, description="a control tick that answers later is reported as stuck"

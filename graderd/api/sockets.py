@@ -1,17 +1,18 @@
-"""The WebSockets: the status stream, the wires, and the jog whose lease ends with its connection."""
+"""The WebSockets: status stream, wires, and what moves: jog and maneuver, whose lease ends with their connection."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 from collections.abc import AsyncGenerator, Coroutine
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, WebSocket
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 from starlette.websockets import WebSocketDisconnect
 
-from graderd.api.http_routes import ConnectionNames, StatusTexts, obey
+from graderd.api.http_routes import ConnectionNames, StatusTexts, obey, service_request
 from graderd.api.limiter import Closing
 from graderd.api.port import DaemonPort, ServiceError
 from graderd.api.problem import Problem, ProblemError, answer, problem_of_validation
@@ -48,9 +49,20 @@ def socket_routes(
         await socket.accept()
         session = _JogSession(port, limits, stops, ConnectionNames().of(client, socket))
         try:
-            await _until_closed(socket, session.run(socket), closing)
+            await _until_closed(socket, session.run(socket), closing, reads=True)
         finally:
             await session.release()
+
+    @router.websocket("/services/{name}")
+    async def maneuver(socket: WebSocket, name: str) -> None:
+        offered = port.services().get(name)
+        if offered is None or not offered.moves:
+            problem = Problem(error=f"no service '{printable(name)[:60]}' moves the blade", where="services")
+            await answer(404, problem, socket.scope, socket.receive, socket.send)
+            return
+        await socket.accept()
+        session = _ManeuverSession(port, limits, stops, name, service_request(name, offered))
+        await _until_closed(socket, session.run(socket), closing, reads=True)
 
     @router.websocket("/bus/{name}")
     async def bus(socket: WebSocket, name: str) -> None:
@@ -142,6 +154,76 @@ class _JogSession:
         return reply
 
 
+class _ManeuverSession:
+    """A service that moves the blade, for as long as its client is heard."""
+
+    def __init__(
+        self, port: DaemonPort, limits: ApiLimits, stops: StopLane, name: str, arguments: type[BaseModel]
+    ) -> None:
+        self._port = port
+        self._silence_s = limits.maneuver_lease_s
+        self._stops = stops
+        self._name = name
+        self._arguments = arguments
+
+    async def run(self, socket: WebSocket) -> None:
+        """The first message is the request, each further one says that its sender is there."""
+        asked = await self._heard(socket)
+        if asked is None:
+            return
+        try:
+            given = self._arguments.model_validate_json(asked).model_dump(exclude_unset=True)
+        except ValidationError as error:
+            problem = problem_of_validation(error.errors(include_input=False, include_url=False))
+            await socket.send_text(problem.model_dump_json())
+            return
+        working = asyncio.create_task(self._port.service(self._name, given), name=f"api maneuver {self._name}")
+        listening = asyncio.create_task(self._listen(socket), name=f"api maneuver {self._name} lease")
+        try:
+            await asyncio.wait((working, listening), return_when=asyncio.FIRST_COMPLETED)
+            ended = "" if working.done() else listening.result()
+        finally:
+            for task in (working, listening):
+                task.cancel()
+            await asyncio.gather(working, listening, return_exceptions=True)
+        await socket.send_text(self._outcome(working, ended))
+
+    def _outcome(self, working: asyncio.Task[dict[str, Any]], ended: str) -> str:
+        """What came of it, as JSON."""
+        if ended or working.cancelled():
+            return Problem(error=ended or "the daemon ends", where=self._name, remedy="ask again").model_dump_json()
+        error = working.exception()
+        if error is None:
+            return json.dumps({"result": working.result()})
+        if not isinstance(error, ServiceError):
+            raise error
+        return Problem(error=error.message, where=self._name, remedy=error.remedy).model_dump_json()
+
+    async def _listen(self, socket: WebSocket) -> str:
+        """Why the lease is over."""
+        while True:
+            try:
+                async with asyncio.timeout(self._silence_s):
+                    said = await self._heard(socket)
+            except TimeoutError:
+                return f"its client was not heard for {self._silence_s:g} s: it ended, and the blade holds"
+            if said is None:
+                return "the client went away"
+
+    async def _heard(self, socket: WebSocket) -> bytes | None:
+        """The next message, None: the client has gone. A stop in it is carried out."""
+        message = await socket.receive()
+        if message["type"] == "websocket.disconnect":
+            if message.get("code") == TOO_LARGE:
+                await self._stops.carry_out(TOO_LARGE_REASON)
+            return None
+        text = message.get("text")
+        said = text.encode("utf-8", "replace") if text else bytes(message.get("bytes") or b"")
+        if is_stop_command(said):
+            await self._stops.carry_out(said)
+        return said
+
+
 async def _send_status(socket: WebSocket, port: DaemonPort, texts: StatusTexts, rate_hz: float) -> None:
     """Send the newest status, then wait for a newer one and for the client's rate. ``send_text`` waits while the
     client does not read, and what happened meanwhile is skipped: nothing queues up."""
@@ -161,15 +243,18 @@ async def _send_texts(socket: WebSocket, texts: AsyncGenerator[str, None]) -> No
             await socket.send_text(text)
 
 
-async def _until_closed(socket: WebSocket, work: Coroutine[Any, Any, None], closing: Closing) -> None:
-    """Run ``work`` until it is done, the client goes, or the daemon closes."""
+async def _until_closed(
+    socket: WebSocket, work: Coroutine[Any, Any, None], closing: Closing, *, reads: bool = False
+) -> None:
+    """Run ``work`` until it is done, the client goes, or the daemon closes. ``reads``: it reads the messages itself,
+    and finds out that the client has gone."""
     path = socket.url.path
     tasks = [
         asyncio.create_task(work, name=f"api {path}"),
         asyncio.create_task(closing.wait(), name=f"api {path} closing"),
     ]
-    if not path.endswith("/jog"):
-        # The jog reads its own messages; of a stream's client only the end is of interest.
+    if not reads:
+        # Of a stream's client only the end is of interest.
         tasks.append(asyncio.create_task(_client_gone(socket), name=f"api {path} client"))
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

@@ -168,7 +168,7 @@ def _live(context: typer.Context, room: Path, angles_deg: str, yes: bool, as_jso
             f"The blade will turn to {', '.join(f'{angle:+g}' for angle in angles)} degrees, one after the other."
         )
     _agree("Is the blade empty and just above level ground, and is everybody clear of it? Turn it now?", yes)
-    answer = daemon.service("camera.calibrate", LIVE_TIMEOUT_S, consent=True, angles_deg=angles)
+    answer = daemon.maneuver("camera.calibrate", LIVE_TIMEOUT_S, consent=True, angles_deg=angles)
     folder = room / _plain(answer["frame_set"])
     folder.mkdir()
     for name in answer["files"]:

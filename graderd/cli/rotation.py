@@ -91,7 +91,7 @@ def register(app: typer.Typer) -> None:
         Rise, overshoot, settling and play, with the settings used. Disarmed only.
         """
         need_consent("rotation step", f"the blade turns by {by_deg:+g} degrees and back", yes)
-        answer = client_of(context).service("rotation.step_response", SERVICE_S, consent=True, step_deg=by_deg)
+        answer = client_of(context).maneuver("rotation.step_response", SERVICE_S, consent=True, step_deg=by_deg)
         page = answer.pop("report_html", None)
         if report is not None:
             _write(report, page)

@@ -347,13 +347,9 @@ async def test_consent_is_true_and_nothing_that_only_counts_as_true(tmp_path: Pa
         assert daemon.maneuvers == []
 
 
-async def test_a_service_that_moves_ends_with_its_client(tmp_path: Path) -> None:
-    async with serving(tmp_path) as (daemon, path):
-        _, writer = await asyncio.open_unix_connection(str(path))
-        writer.write(
-            b"POST /v1/services/rotation.step_response HTTP/1.1\r\nHost: localhost\r\nContent-Length: 17\r\n"
-            b'Content-Type: application/json\r\n\r\n{"consent": true}'
-        )
-        await daemon.until(lambda: daemon.maneuvers == ["began"])
-        writer.close()
-        await daemon.until(lambda: daemon.maneuvers == ["began", "ended"])
+async def test_a_service_that_moves_is_no_request(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path), client_of(path) as client:
+        answer = await client.post("/v1/services/rotation.step_response", json={"consent": True})
+        assert answer.status_code == 426
+        assert "WebSocket" in answer.json()["remedy"]
+        assert daemon.maneuvers == []

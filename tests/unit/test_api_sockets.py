@@ -232,3 +232,48 @@ async def test_clients_that_vanish_at_any_moment_leave_nothing_behind(
         async with connect(path, "/v1/stream") as stream:
             await stream.recv()
     assert [record for record in caplog.records if record.levelname == "ERROR"] == []
+
+
+STEP = "/v1/services/rotation.step_response"
+CONSENT = json.dumps({"consent": True})
+
+
+async def test_a_maneuver_goes_on_while_its_client_is_heard_and_answers_at_its_end(tmp_path: Path) -> None:
+    loop, limits = asyncio.get_running_loop(), ApiLimits(maneuver_lease_s=0.25)
+    async with serving(tmp_path, limits=limits) as (daemon, path), AsyncClient(path) as client:
+        running = asyncio.create_task(client.maneuver("rotation.step_response", consent=True))
+        await daemon.until(lambda: daemon.maneuvers == ["began"])
+        began_s = loop.time()
+        await daemon.until(lambda: loop.time() - began_s > 3 * 0.25)
+        assert daemon.maneuvers == ["began"]
+        daemon.maneuver_done.set()
+        assert await within(5, running) == {"overshoot_percent": 1.5}
+
+
+@pytest.mark.parametrize("how", ["silent", "gone", "stop"])
+async def test_a_maneuver_ends_with_its_client(tmp_path: Path, how: str) -> None:
+    """Also with one that stands still (SIGSTOP) while the kernel keeps its connection open."""
+    async with serving(tmp_path) as (daemon, path):
+        async with connect(path, STEP) as socket:
+            await socket.send(CONSENT)
+            await daemon.until(lambda: daemon.maneuvers == ["began"])
+            if how == "stop":
+                await socket.send(json.dumps({"command": "stop", "reason": "enough"}))
+                await daemon.until(lambda: daemon.state.mode is Mode.STOPPED)
+                assert "enough" in daemon.state.reason
+            if how != "gone":
+                assert "was not heard for 0.5 s" in json.loads(await within(5, socket.recv()))["error"]
+        await daemon.until(lambda: daemon.maneuvers == ["began", "ended"])
+
+
+async def test_a_maneuver_is_asked_for_as_its_description_says(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path):
+        for asked, where in (({"consent": "false"}, "consent"), ({"consent": True, "step": 5}, "step")):
+            async with connect(path, STEP) as socket:
+                assert (await ask(socket, **asked))["where"] == where
+        for name in ("rotation.reboot", "nothing"):
+            with pytest.raises(InvalidStatus) as refused:
+                async with connect(path, f"/v1/services/{name}"):
+                    raise AssertionError("it was opened")
+            assert refused.value.response.status_code == 404
+        assert daemon.maneuvers == []

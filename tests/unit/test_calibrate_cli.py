@@ -169,8 +169,10 @@ def test_the_daemon_turns_the_blade_only_with_consent(
 
     class Daemon:
         def service(self, name: str, timeout_s: float, **arguments: Any) -> dict[str, Any]:
-            if name == "camera.calibration_file":
-                return {"base64": base64.b64encode((frames / arguments["file"]).read_bytes()).decode()}
+            assert name == "camera.calibration_file"
+            return {"base64": base64.b64encode((frames / arguments["file"]).read_bytes()).decode()}
+
+        def maneuver(self, name: str, timeout_s: float, **arguments: Any) -> dict[str, Any]:
             asked.append({"name": name, **arguments})
             return {"frame_set": "calibration-1", "files": names}
 

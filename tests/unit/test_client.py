@@ -7,8 +7,8 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import AsyncExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +155,54 @@ async def test_a_control_tick_that_does_not_answer_leaves_it_open_whether_it_was
             await client.command("arm")
     assert unanswered.value.status_code == 504
     assert unanswered.value.may_be_done
+
+
+@pytest.mark.parametrize("lane", ["serves stops", "hangs", "is a stranger's", "is not there"])
+async def test_a_stop_over_tcp_takes_its_own_port_and_else_the_interfaces(lane: str) -> None:
+    heard: list[str] = []
+
+    def server(name: str, answer: bytes) -> Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]:
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            with suppress(OSError, asyncio.IncompleteReadError):
+                await reader.readuntil(b"\r\n\r\n")
+                heard.append(name)
+                writer.write(answer)
+                await reader.read()
+            writer.close()
+
+        return serve
+
+    reply = b'{"command": "stop", "accepted": true, "message": "stopped"}'
+    stopped = b"HTTP/1.1 200 OK\r\ncontent-length: %d\r\n\r\n%s" % (len(reply), reply)
+    answers = {
+        "serves stops": stopped,
+        "hangs": b"",
+        "is a stranger's": b"HTTP/1.1 404 No\r\ncontent-length: 0\r\n\r\n",
+    }
+    port_n, sockets = _two_ports()
+    async with AsyncExitStack() as stack:
+        await stack.enter_async_context(await asyncio.start_server(server("interface", stopped), sock=sockets[0]))
+        if lane in answers:
+            await stack.enter_async_context(await asyncio.start_server(server("lane", answers[lane]), sock=sockets[1]))
+        else:
+            sockets[1].close()
+        assert (await AsyncClient(f"http://127.0.0.1:{port_n}", token="t").stop()).accepted
+    expected = {"serves stops": ["lane"], "is not there": ["interface"]}
+    assert heard == expected.get(lane, ["lane", "interface"])
+
+
+def _two_ports() -> tuple[int, list[socket.socket]]:
+    """Two free ports, one after the other."""
+    while True:
+        first, second = socket.socket(), socket.socket()
+        first.bind(("127.0.0.1", 0))
+        try:
+            second.bind(("127.0.0.1", first.getsockname()[1] + 1))
+        except (OSError, OverflowError):
+            first.close()
+            second.close()
+            continue
+        return first.getsockname()[1], [first, second]
 
 
 async def test_over_tcp_with_the_token_and_not_without(tmp_path: Path) -> None:
