@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from graderd.core.blade import STEEPEST_MEETING_DEG, BladeGeometry, meeting_point, third_bounds_m
+from graderd.core.blade import STEEPEST_MEETING_DEG, BladeGeometry, meeting_point
 from graderd.core.soil import Zone
 from graderd.hal.camera import DepthImage
 from graderd.perception.decide import Verdict, decide
@@ -108,7 +108,7 @@ class DepthJudge:
         # The stride is meant for a picture 848 pixels across; a smaller one is sampled as densely on the ground.
         self._stride = max(1, round(settings.stride_px * view.lens.width / NOMINAL_WIDTH_PX))
         rays = view.rays(self._stride)
-        self._rays = np.ascontiguousarray(rays.reshape(-1, 3).T)
+        self._rays = np.ascontiguousarray(rays.reshape(-1, 3).T) * np.float32(0.001)  # a millimetre of depth each
         self._ground = GroundFit(
             blade, view.position_m, settings.ground_offset_limit_m, settings.ground_slope_limit_deg
         )
@@ -131,15 +131,17 @@ class DepthJudge:
     def height_map(self, depth_mm: DepthImage, stance: Stance) -> HeightMap:
         """Measure one depth picture (uint16, mm along the optical axis, 0 = no value)."""
         blade, angle_deg = self._blade, stance.angle_deg
-        pixels, points = self._points(depth_mm)
+        points = self._points(depth_mm)
         ground = self._ground.fit(points[0], points[1], points[2], angle_deg)
         edge = self._finder.upper_edge(depth_mm, stance, ground)
         ground, cut_m = self._layer(ground, edge, stance)
         s, d, z = self._in_blade(points, ground, angle_deg)
         # Some way behind and beside the blade too, where its face is looked for.
         wide = np.float32(blade.length_m / 2 + self._travel_m * BESIDE_RATIO)
-        near = np.flatnonzero((np.abs(d - np.float32(0.22)) < np.float32(STANDING_REACH_M - 0.22)) & (np.abs(s) < wide))
-        pixels, s, d, z, raw_z = pixels[near], s[near], d[near], z[near], points[2][near]
+        pixels = np.flatnonzero(
+            (np.abs(d - np.float32(0.22)) < np.float32(STANDING_REACH_M - 0.22)) & (np.abs(s) < wide)
+        )
+        s, d, z, raw_z = s[pixels], d[pixels], z[pixels], points[2][pixels]
         above_edge = self._above_edge(s, z, raw_z, edge, stance)
         lean = np.float32(stance.lean) * np.clip(above_edge, 0, np.float32(blade.height_m))
         face = d + self._finder.setback(above_edge) - lean  # 0 on the face
@@ -153,9 +155,14 @@ class DepthJudge:
         d, face = np.asarray(d + moved, dtype=np.float32), np.asarray(face + moved, dtype=np.float32)
         s = np.asarray(s - np.float32(fix.along_m) - turn * d, dtype=np.float32)
         stands = standing(s, d, z, blade.length_m / 2, STANDING_REACH_M)
-        wanted = np.flatnonzero(low & (d < blade.reach_m + CONTEXT_M))
-        valid = self._valid_shares(pixels[wanted], angle_deg)
-        in_front = wanted[(face[wanted] > np.float32(FACE_MARGIN_M)) & (d[wanted] > 0)]
+        low &= d < np.float32(blade.reach_m + CONTEXT_M)
+        valid = self._valid_shares(pixels[np.flatnonzero(low)], angle_deg)
+        in_front = np.flatnonzero(
+            low
+            & (face > np.float32(FACE_MARGIN_M))
+            & (d > 0)
+            & (np.abs(s) < np.float32(self._cells.s_m.size * self._cell_s_m / 2))
+        )
         soil = self._map(s[in_front], d[in_front], z[in_front], ground, fix, valid, angle_deg)
         return replace(soil, edge=edge, standing_at_m=stands, cut_m=cut_m)
 
@@ -232,15 +239,13 @@ class DepthJudge:
             )
         return verdict
 
-    def _points(self, depth_mm: DepthImage) -> tuple[I64, F32]:
-        """Indices of the sampled pixels that have depth, and their points in the vehicle frame (3 x N)."""
+    def _points(self, depth_mm: DepthImage) -> F32:
+        """Points in the vehicle frame of the sampled pixels (3 x N); NaN where one has no depth."""
         stride = self._stride
         depth = depth_mm[stride // 2 :: stride, stride // 2 :: stride].ravel()
-        valid = np.flatnonzero(depth)
-        points = np.take(self._rays, valid, axis=1)
-        points *= depth[valid] * np.float32(0.001)
+        points: F32 = self._rays * np.where(depth, depth, np.float32(np.nan))
         points += self._position[:, None]
-        return valid, points
+        return points
 
     def _in_blade(self, points: F32, ground: Ground, angle_deg: float) -> tuple[F32, F32, F32]:
         """Points in blade coordinates s and d, and their heights above the ground."""
@@ -287,8 +292,6 @@ class DepthJudge:
         along_n = self._cells.s_m.size
         half = np.float32(along_n * self._cell_s_m / 2)
         noise_m = self._noise_m(ground, angle_deg)
-        inside = np.flatnonzero(np.abs(s) < half)
-        s, d, z = s[inside], d[inside], z[inside]
         ahead_n = self._ahead_n + self._context_n
         i = np.minimum(((s + half) * np.float32(1 / self._cell_s_m)).astype(np.int32), along_n - 1)
         j = np.minimum((d * np.float32(1 / self._cell_d_m)).astype(np.int32), ahead_n - 1)
@@ -402,13 +405,17 @@ def split_soil(
     carried = np.clip(np.minimum.accumulate(rise, axis=1) - slope * cells.d_m, 0.0, height_m)
     carried[np.abs(cells.s_m) > blade.length_m / 2] = 0.0  # nothing to lean on
     met_s, met_m = meeting_point(cells.s_m[:, None], cells.d_m[None, :], angle_deg)
-    borders = (-blade.length_m / 2, *third_bounds_m(blade.length_m), blade.length_m / 2)
-    third, met = np.digitize(cells.s_m, borders), np.digitize(met_s, borders)
+    met = _third(met_s, blade)
     met[np.broadcast_to(met_m > travel_m, met.shape)] = 0
     litres = 1000.0 * cells.area_m2
-    leaning = np.bincount(third, weights=carried.sum(axis=1), minlength=5) * litres
+    leaning = np.bincount(_third(cells.s_m, blade), weights=carried.sum(axis=1), minlength=5) * litres
     coming = np.bincount(met.ravel(), weights=(height_m - carried).ravel(), minlength=5) * litres
     return _inner(leaning), _inner(coming)
+
+
+def _third(s_m: F64, blade: BladeGeometry) -> I64:
+    """1, 2, 3 for the right, center and left third in which places lie; 0 and 4 for what lies beyond the ends."""
+    return np.clip(np.floor(s_m * (3.0 / blade.length_m) + 2.5), 0.0, 4.0).astype(np.intp)
 
 
 def _inner(amounts: npt.NDArray[np.floating]) -> ThirdsL:

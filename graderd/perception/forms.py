@@ -130,27 +130,33 @@ def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[flo
     inside = np.flatnonzero(
         (z > LOWEST_M) & (z < HIGHEST_M) & (d > STANDING_FROM_M) & (d < reach_m) & (np.abs(s) < half_m)
     )
-    if inside.size < STANDING_COLUMNS_N * LEVELS_N * LEVEL_POINTS_N:
-        return None
     columns_n, rows_n = int(2 * half_m / CELL_M) + 1, int(reach_m / CELL_M) + 1
     levels_n = round((HIGHEST_M - LOWEST_M) / LEVEL_M) + 1
     i = ((s[inside] + np.float32(half_m)) * np.float32(1 / CELL_M)).astype(np.int32)
     j = (d[inside] * np.float32(1 / CELL_M)).astype(np.int32)
     k = ((z[inside] - np.float32(LOWEST_M)) * np.float32(1 / LEVEL_M)).astype(np.int32)
-    counts = np.bincount((i * rows_n + j) * levels_n + k, minlength=columns_n * rows_n * levels_n)
-    there = counts.reshape(columns_n, rows_n, levels_n) >= LEVEL_POINTS_N
-    runs = there[:, :, : 1 - LEVELS_N].copy()
-    for level in range(1, LEVELS_N):
-        runs &= there[:, :, level : there.shape[2] - LEVELS_N + 1 + level]
-    upright = np.asarray(runs.any(axis=2), dtype=np.bool_)
-    if np.count_nonzero(upright) < STANDING_COLUMNS_N:
+    column = i * rows_n + j
+    counts = np.bincount(column * levels_n + k, minlength=columns_n * rows_n * levels_n).reshape(-1, levels_n)
+    # Few columns reach so high as to hold a run.
+    high = np.flatnonzero(np.bincount(column[k >= LEVELS_N - 1], minlength=len(counts)) >= LEVEL_POINTS_N)
+    if high.size < STANDING_COLUMNS_N:
         return None
-    starts = runs.argmax(axis=2)
-    soil = np.where(there.any(axis=2) & ~upright, there.argmax(axis=2), -1)
+    there = counts[high] >= LEVEL_POINTS_N
+    runs = there[:, : 1 - LEVELS_N].copy()
+    for level in range(1, LEVELS_N):
+        runs &= there[:, level : levels_n - LEVELS_N + 1 + level]
+    is_upright = runs.any(axis=1)
+    if np.count_nonzero(is_upright) < STANDING_COLUMNS_N:
+        return None
+    places = np.column_stack(np.divmod(high[is_upright], rows_n))
+    starts = runs[is_upright].argmax(axis=1)
+    upright = np.zeros((columns_n, rows_n), dtype=np.bool_)
+    upright[places[:, 0], places[:, 1]] = True
+    levels = (counts >= LEVEL_POINTS_N).reshape(columns_n, rows_n, levels_n)
     found = [
         at
-        for at in np.argwhere(upright)
-        if starts[*at] < LOW_STARTS_N or starts[*at] <= min(_level(soil, upright, at) + 2, ON_SOIL_STARTS_N - 1)
+        for at, start in zip(places, starts, strict=True)
+        if start < LOW_STARTS_N or start <= min(_level(levels, upright, at) + 2, ON_SOIL_STARTS_N - 1)
     ]
     if len(found) < STANDING_COLUMNS_N:
         return None
@@ -158,11 +164,13 @@ def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[flo
     return float(at_s + 0.5) * CELL_M - half_m, float(at_d + 0.5) * CELL_M
 
 
-def _level(soil: Counts, upright: Bools, at: Counts) -> int:
-    """The level at which soil lies beside an upright column."""
+def _level(levels: Bools, upright: Bools, at: Counts) -> int:
+    """The level at which soil lies beside an upright column; -1 where none does."""
     around = tuple(slice(max(i - BESIDE_COLUMNS_N, 0), i + BESIDE_COLUMNS_N + 1) for i in at)
-    plain = soil[around][~upright[around]]
-    return int(np.median(plain)) if plain.size else -1
+    plain = levels[around][~upright[around]]
+    lowest = plain.argmax(axis=1)
+    # A column in which nothing was seen says so.
+    return int(np.median(np.where(plain.any(axis=1), lowest, -1))) if plain.size else -1
 
 
 def above_neighbours(height: F64, seen: Bools, rise_per_cell: float) -> F64:

@@ -7,6 +7,7 @@ and how deep the edge should be. What is found also tells when the camera was kn
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -294,8 +295,10 @@ class BladeFinder:
         best = tall.argmax(axis=1)  # the rearmost where several are as tall
         upright = tall[np.arange(self.COLUMNS_N), best] >= UPRIGHT_LEVELS_N
         on_it = (place == best[column]) | (place == best[column] + 1)
-        middles = [middle(face[on_it & (column == i)]) for i in np.flatnonzero(upright)]
-        return np.asarray(middles, dtype=np.float64), upright
+        on_it &= upright[column]
+        count = np.bincount(column[on_it], minlength=self.COLUMNS_N)
+        total = np.bincount(column[on_it], weights=face[on_it], minlength=self.COLUMNS_N)
+        return np.asarray(total[upright] / count[upright], dtype=np.float64), upright
 
     def _ends(self, s: F32) -> float:
         if s.size < 60:
@@ -313,12 +316,19 @@ def _cos_sin(angle_deg: float) -> tuple[np.float32, np.float32]:
     return np.float32(math.cos(math.radians(angle_deg))), np.float32(math.sin(math.radians(angle_deg)))
 
 
+@functools.cache
+def _pairs(count: int, apart: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Indices of all pairs that are so far apart at least."""
+    first, second = np.triu_indices(count, apart)
+    return first, second
+
+
 def _line_of_most(s: F64, face: F64) -> tuple[float, float]:
     """Place at s = 0 and slope of the line on which most of the places lie, and the rearmost of such lines.
 
     The flank of a heap stands as upright as the face in a column or two, ahead of it; nothing stands behind it.
     """
-    first, second = np.triu_indices(s.size, APART_COLUMNS_N)
+    first, second = _pairs(s.size, APART_COLUMNS_N)
     slope = (face[second] - face[first]) / (s[second] - s[first])
     at_0 = face[first] - slope * s[first]
     off = face - at_0[:, None] - slope[:, None] * s
@@ -333,7 +343,7 @@ def _line_of_most(s: F64, face: F64) -> tuple[float, float]:
 
 def _median_slope(s: F64, z: F64) -> float:
     """Slope of a line through points of which some lie elsewhere (Theil and Sen)."""
-    first, second = np.triu_indices(s.size, 1)
+    first, second = _pairs(s.size, 1)
     apart = s[second] - s[first]
     wide = np.abs(apart) > 0.1
     return middle((z[second] - z[first])[wide] / apart[wide]) if wide.any() else 0.0
