@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from graderd import places
-from graderd.cli import calibrate_lifts, calibrate_rotation
+from graderd.cli import calibrate_color, calibrate_lifts, calibrate_rotation
 from graderd.cli.console import CliError, ExitCode, Json, agree, client_of, example, plain_table, print_json, print_text
 from graderd.hal.errors import DeviceError
 
@@ -37,6 +37,7 @@ def register(app: typer.Typer) -> None:
     def calibrate() -> None:
         """Find out how this machine differs from the drawing, and write it down."""
 
+    calibrate_color.register(group)
     calibrate_lifts.register(group)
     calibrate_rotation.register(group)
 
@@ -101,7 +102,7 @@ def register(app: typer.Typer) -> None:
             print_text(_result_text(settings, result, save))
         _agree(f"Do LEFT and RIGHT in {save} stand where yours are, facing forward? Write to {path}?", yes)
         backup = write_calibration(path, _changes(result))
-        _done(path, backup, json)
+        done(path, backup, json)
 
 
 def load_config(path: Path, must_exist: bool) -> Config:
@@ -144,7 +145,7 @@ def _by_hand(path: Path, settings: Config, pose: dict[str, float], yes: bool, as
     )
     _agree(f"Write this pose to {path}?", yes)
     backup = write_calibration(path, {"camera": {"calibration": calibration.model_dump()}})
-    _done(path, backup, as_json)
+    done(path, backup, as_json)
 
 
 def _recorded(source: Path) -> FrameSet:
@@ -308,7 +309,8 @@ def _may_save(picture: Path) -> None:
         raise CliError(str(picture), "cannot be written", "Name another with --save")
 
 
-def _done(path: Path, backup: Path | None, as_json: bool) -> None:
+def done(path: Path, backup: Path | None, as_json: bool) -> None:
+    """Say what was written."""
     if as_json:
         print_json({"written": str(path), "backup": str(backup) if backup else None})
         return

@@ -52,7 +52,7 @@ class MachineSettings(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Unmet:
-    """A mandatory requirement for arming that is not met."""
+    """A requirement that is not met."""
 
     name: str
     reason: str
@@ -95,6 +95,7 @@ class Inputs(NamedTuple):
     the gate lets it have; ``arrived``: at its goal. ``held``: why an axis with a goal was not let move, by axis.
     All three speak of the goals of the tick before.
     ``devices_active``: all required devices are ACTIVE. ``arm_error``: why arming the devices failed, once.
+    ``unmet``: mandatory for arming and not met; ``unmet_for_auto``: for automatic operation.
     ``resolve``: turns a jog or preset into goals in stages, or gives the reason it cannot.
     """
 
@@ -110,6 +111,7 @@ class Inputs(NamedTuple):
     devices_active: bool = False
     arm_error: str = ""
     unmet: tuple[Unmet, ...] = ()
+    unmet_for_auto: tuple[Unmet, ...] = ()
     faults: tuple[ActiveFault, ...] = ()
 
 
@@ -239,6 +241,8 @@ def _obey(state: State, command: cmd.Command, inputs: Inputs, settings: MachineS
                 )
             if state.mode is Mode.AUTO:
                 return yes(state, "already automatic")
+            if inputs.unmet_for_auto:
+                return no(*_told(inputs.unmet_for_auto))
             return yes(replace(_manual(state, "automatic operation"), mode=Mode.AUTO), "automatic")
         case cmd.Manual():
             if state.mode not in ARMED:
@@ -286,14 +290,19 @@ def _arm(
         # Arming writes and reads back limits and watchdogs; devices left active from before must not skip that.
         return no("the devices are still being released", "arm again in a moment")
     if inputs.unmet:
-        return no(
-            "not ready: " + "; ".join(f"{u.name}: {u.reason}" for u in inputs.unmet),
-            "; ".join(dict.fromkeys(u.remedy for u in inputs.unmet if u.remedy)),
-        )
+        return no(*_told(inputs.unmet))
     fault = worst(inputs.faults)
     if fault is not None and fault.row.reaction >= Reaction.DISARM:
         return no(f"{fault.name}: {fault.row.reads}", fault.row.remedy)
     return yes(replace(state, arming_since_s=inputs.now_s, reason="arming"), "arming")
+
+
+def _told(unmet: tuple[Unmet, ...]) -> tuple[str, str]:
+    """What is not met, and the remedies."""
+    return (
+        "not ready: " + "; ".join(f"{u.name}: {u.reason}" for u in unmet),
+        "; ".join(dict.fromkeys(u.remedy for u in unmet if u.remedy)),
+    )
 
 
 def _advance(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSettings) -> State:

@@ -1,4 +1,7 @@
-"""What must be true before the machine may be armed, each with its remedy. ``arm`` refuses while one is unmet."""
+"""What must be true before the machine may be armed, each with its remedy. ``arm`` refuses while one is unmet.
+
+One is asked for automatic operation alone (``AUTOMATIC``): ``auto`` refuses while it is unmet.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,9 @@ from graderd.core.axes import UNITS, AxisFigures, Pose
 from graderd.core.faults.monitor import ActiveFault, Clear, Reaction
 from graderd.core.machine import Mode, State, Unmet
 from graderd.hal.device import Lifecycle
+
+AUTOMATIC = "automatic"
+NO_AUTO_REMEDY = 'set method = "depth" in [perception], or measure it: graderd calibrate color --from FRAME_SET'
 
 
 class Requirement(NamedTuple):
@@ -41,8 +47,9 @@ def requirements(
     pose: Pose,
     figures: Mapping[str, AxisFigures],
     faults: Sequence[ActiveFault],
+    no_auto: str = "",
 ) -> tuple[Requirement, ...]:
-    """The readiness list at this moment."""
+    """The readiness list at this moment; ``no_auto``: why what sees the soil may not drive, empty where it may."""
     found = [_not_stopped(state)]
     for name, axis in axes.items():
         found.append(_connected(name, axis, faults))
@@ -59,6 +66,8 @@ def requirements(
             camera[0].row.remedy if camera else "",
         )
     )
+    by_soil = no_auto or "what sees the soil may drive"
+    found.append(Requirement(AUTOMATIC, not no_auto, False, by_soil, NO_AUTO_REMEDY if no_auto else ""))
     return tuple(found)
 
 

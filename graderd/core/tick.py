@@ -22,7 +22,7 @@ from graderd.core.lift_pair import LiftCoordinator, LiftPairSettings, SideReadin
 from graderd.core.machine import ARMED, Inputs, Intents, MachineSettings, Mode, State, step
 from graderd.core.motion import resolve
 from graderd.core.plausibility import AxisSample, MotionFigures, PlausibilityMonitor, axis_sample
-from graderd.core.readiness import Requirement, requirements
+from graderd.core.readiness import AUTOMATIC, Requirement, requirements
 from graderd.core.rule import RuleSettings, Travel
 from graderd.core.soil import SoilObservation
 from graderd.hal.device import Lifecycle
@@ -45,6 +45,7 @@ class TickSettings:
     ``motion``: what is plausible for each axis. ``overrun_s``: a tick later than this is a fault.
     ``max_frame_age_s``: the soil of an older picture is unknown.
     ``max_vehicle_age_s``: with older readings it is not known how the machine drives.
+    ``no_auto``: why what sees the soil may not drive; empty where it may.
     """
 
     figures: Mapping[str, AxisFigures]
@@ -58,6 +59,7 @@ class TickSettings:
     overrun_s: float = 0.1
     max_frame_age_s: float = 0.5
     max_vehicle_age_s: float = 0.5
+    no_auto: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,6 +191,7 @@ class Controller:
                 devices_active=sensed.powered,
                 arm_error=sensed.arm_error,
                 unmet=tuple(r.unmet() for r in readiness if r.mandatory and not r.met),
+                unmet_for_auto=tuple(r.unmet() for r in readiness if r.name == AUTOMATIC and not r.met),
                 faults=self._faults.active,
             ),
             settings.machine,
@@ -301,7 +304,9 @@ class Controller:
         return [*sensed.faults, *implausible, *self._lift.faults(sensed.now_s), *self._own_faults.present(sensed.now_s)]
 
     def _readiness(self, sensed: Sensed, pose: Pose) -> tuple[Requirement, ...]:
-        return requirements(self._state, sensed.axes, pose, self._settings.figures, self._faults.active)
+        settings = self._settings
+        faults = self._faults.active
+        return requirements(self._state, sensed.axes, pose, settings.figures, faults, settings.no_auto)
 
     def _note_late(self, late_s: float, now_s: float) -> None:
         if late_s <= self._settings.overrun_s:

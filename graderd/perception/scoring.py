@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from graderd.core.soil import SoilObservation, Zone
+from graderd.perception.settings import LABELS, ColorMethodName, PerceptionSettings, SiteFigure
 
 PILES = (Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN)
 OPPOSITE = {Zone.LEFT: Zone.RIGHT, Zone.RIGHT: Zone.LEFT}
@@ -83,3 +84,27 @@ class Score:
             "cpu_ms_median": round(float(np.median(self.cpu_ms)), 3) if self.cpu_ms else None,
             "cpu_ms_p99": round(float(np.percentile(self.cpu_ms, 99)), 3) if self.cpu_ms else None,
         }
+
+
+def site_figure(score: Score, settings: PerceptionSettings, measured_at: str) -> SiteFigure:
+    """What ``settings.method``, a colour method, was worth on the frames of ``score``.
+
+    Raises:
+        ValueError: the method is none that goes by colour alone.
+    """
+    method: ColorMethodName
+    match settings.method:
+        case "paper" | "fast_color" as method:
+            pass
+        case other:
+            raise ValueError(f"{other} does not go by colour")
+    return SiteFigure(
+        method=method,
+        settings_mark=settings.color_mark(),
+        measured_at=measured_at,
+        frames_least_n=min(sum(score.confusion[label].values()) for label in LABELS),
+        right_percent=round(100.0 * score.accuracy, 2),
+        answered_percent=round(100.0 * score.answered_share, 2),
+        sides_swapped_n=score.left_right_n,
+        false_piles_percent=round(100.0 * score.false_pile_share, 2),
+    )

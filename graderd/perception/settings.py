@@ -5,6 +5,7 @@ Both are sections of the configuration file. Every number carries its unit in it
 
 from __future__ import annotations
 
+import hashlib
 import math
 from typing import Annotated, Literal
 
@@ -22,6 +23,44 @@ Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Percent = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 HueDegrees = Annotated[float, Field(ge=0, le=360, allow_inf_nan=False)]
 HueHalfDegrees = Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)]
+
+
+ColorMethodName = Literal["paper", "fast_color"]
+LABELS = ("left", "center", "right", "even", "none")
+RIGHT_LEAST_PERCENT = 98.0
+"""What depth is held to as well: of a hundred answers two may be wrong."""
+ANSWERED_LEAST_PERCENT = 95.0
+FALSE_PILES_MOST_PERCENT = 1.0
+FRAMES_LEAST_N = 20
+"""Labelled frames of each of the five beds: with fewer a method that guesses may seem right."""
+
+
+class SiteFigure(Settings):
+    """What a colour method was worth on labelled frames of this site, as ``graderd calibrate color`` found it."""
+
+    method: ColorMethodName
+    settings_mark: str = Field(description="of the colour and decision settings it was measured with")
+    measured_at: str = ""
+    frames_least_n: int = Field(ge=0, description="labelled frames of the bed that has fewest of them")
+    right_percent: Percent = Field(description="of the answers")
+    answered_percent: Percent = Field(description="of the frames")
+    sides_swapped_n: int = Field(ge=0, description="frames in which one side was taken for the other")
+    false_piles_percent: Percent = Field(description="of the empty beds")
+
+    def falls_short(self) -> str:
+        """Why the method may not drive by this figure; empty where it may."""
+        if self.frames_least_n < FRAMES_LEAST_N:
+            beds = ", ".join(LABELS)
+            return f"{self.frames_least_n} frames of one of the beds {beds}, {FRAMES_LEAST_N} of each are asked"
+        if self.right_percent < RIGHT_LEAST_PERCENT:
+            return f"{self.right_percent:.1f} % of the answers were right, {RIGHT_LEAST_PERCENT:g} % are asked"
+        if self.answered_percent < ANSWERED_LEAST_PERCENT:
+            return f"{self.answered_percent:.1f} % of the frames were answered, {ANSWERED_LEAST_PERCENT:g} % are asked"
+        if self.sides_swapped_n:
+            return f"left and right were taken for each other {self.sides_swapped_n} times"
+        if self.false_piles_percent >= FALSE_PILES_MOST_PERCENT:
+            return f"{self.false_piles_percent:.1f} % of the empty beds were called a pile"
+        return ""
 
 
 class ColorSettings(Settings):
@@ -50,6 +89,9 @@ class ColorSettings(Settings):
         default=0.5, description="of the contour's length, for the approximation"
     )
     none_area_percent: Percent = Field(default=6.0, description="soil on less of the blade's region than this: none")
+    site_figure: SiteFigure | None = Field(
+        default=None, description="written by `graderd calibrate color`; without it colour does not drive"
+    )
 
     @model_validator(mode="after")
     def _one_reading(self) -> ColorSettings:
@@ -183,6 +225,26 @@ class PerceptionSettings(Settings):
     depth: DepthSettings = Field(default_factory=DepthSettings)
     decision: DecisionSettings = Field(default_factory=DecisionSettings)
     health: HealthSettings = Field(default_factory=HealthSettings)
+
+    def color_mark(self) -> str:
+        """Changes with whatever a colour method's answer depends on."""
+        text = self.color.model_dump_json(exclude={"site_figure"}) + self.decision.model_dump_json()
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    def why_not_to_drive(self) -> str:
+        """Why automatic operation may not go by this method's answers; empty where it may.
+
+        Colour takes rust, plywood and shade for soil: it drives only where frames of the site have shown its worth.
+        """
+        if self.method in ("depth", "fused"):
+            return ""
+        figure = self.color.site_figure
+        if figure is None or figure.method != self.method:
+            return f"perception goes by {self.method}, whose worth on this site nobody has measured"
+        if figure.settings_mark != self.color_mark():
+            return f"the settings of {self.method} are not those that were measured on this site"
+        short = figure.falls_short()
+        return f"{self.method} is not good enough on this site: {short}" if short else ""
 
 
 Mounting = Literal["facing_blade_from_front", "facing_blade_from_behind"]
@@ -323,6 +385,7 @@ __all__ = [
     "METHODS",
     "BladeGeometry",
     "CameraCalibration",
+    "ColorMethodName",
     "ColorSettings",
     "DecisionSettings",
     "DepthSettings",
@@ -330,6 +393,7 @@ __all__ = [
     "Method",
     "Mounting",
     "PerceptionSettings",
+    "SiteFigure",
     "StreamCalibration",
     "angles_from_rotation",
     "rotation_from_angles",

@@ -59,6 +59,7 @@ def tick_settings(config: Config) -> TickSettings:
         overrun_s=config.control.overrun_s,
         max_frame_age_s=config.perception.decision.max_frame_age_s,
         max_vehicle_age_s=config.vehicle.max_age_s,
+        no_auto=config.perception.why_not_to_drive(),
     )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from graderd.client import RefusedError
 from graderd.simulator.control_client import RigControl
 from tests.machine import READY_S, machine, start_rig
 
@@ -167,6 +168,19 @@ async def test_a_second_daemon_on_the_same_socket_says_so_and_disturbs_nothing(t
         status = await whole.status()
         assert all(a.lifecycle == "standby" for a in status.axes.values())
         assert status.mode == "disarmed"
+
+
+async def test_a_colour_method_that_nobody_measured_here_does_not_drive(tmp_path: Path) -> None:
+    async with machine(tmp_path, '[perception]\nmethod = "fast_color"\n') as whole:
+        await whole.until(lambda s: all(r.met for r in s.readiness if r.mandatory))
+        await whole.command("arm")
+        await whole.until(lambda s: s.mode == "manual")
+        with pytest.raises(RefusedError, match="fast_color, whose worth on this site nobody has measured") as refused:
+            await whole.command("auto")
+        assert "graderd calibrate color" in refused.value.remedy
+        status = await whole.status()
+        assert status.mode == "manual"
+        assert not next(r.met for r in status.readiness if r.name == "automatic")
 
 
 async def test_without_any_device_it_says_what_is_missing_and_refuses_to_arm(tmp_path: Path) -> None:

@@ -180,6 +180,21 @@ def test_replies_come_in_the_order_of_the_commands() -> None:
     assert tick.stopped_now
 
 
+@pytest.mark.parametrize("no_auto", ["", "colour was never measured here"])
+def test_what_may_not_drive_is_refused_automatic_operation_alone(no_auto: str) -> None:
+    controller = Controller(replace(SETTINGS, no_auto=no_auto))
+    controller.step(Sensed(1.0, standing(1.0, HOME, Lifecycle.STANDBY), commands=(cmd.Arm(),)))
+    controller.step(Sensed(1.02, standing(1.02, HOME), powered=True))
+    tick = controller.step(Sensed(1.04, standing(1.04, HOME), commands=(cmd.Auto(),), powered=True))
+    assert tick.replies[0].accepted is not bool(no_auto)
+    assert tick.state.mode is (Mode.MANUAL if no_auto else Mode.AUTO)
+    asked = next(one for one in tick.readiness if one.name == readiness.AUTOMATIC)
+    assert (asked.met, asked.mandatory) == (not no_auto, False)
+    if no_auto:
+        assert no_auto in tick.replies[0].message
+        assert "calibrate color" in tick.replies[0].remedy
+
+
 def test_a_held_axis_has_not_arrived() -> None:
     controller, at = Controller(SETTINGS), HOME
     step = partial(Sensed, powered=True)
