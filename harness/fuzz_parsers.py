@@ -31,7 +31,7 @@ from graderd.drivers.dynamixel.table import ControlTable
 from graderd.drivers.electrak.profile import load_profile
 from graderd.firmware_profiles import UnknownProfileError
 from graderd.hal.camera import Frame
-from graderd.hal.errors import DeviceError
+from graderd.hal.errors import DeviceError, WrongDeviceError
 from graderd.perception.frame_set import Entry, FrameSet, FrameSetWriter
 from graderd.perception.settings import CameraCalibration
 from graderd.runtime.perception_protocol import FromChild, Observed
@@ -140,7 +140,7 @@ def targets(directory: Path) -> dict[str, Target]:
 def _profile(name: str) -> object:
     try:
         return ControlTable.load(name)
-    except (UnknownProfileError, KeyError):
+    except (UnknownProfileError, WrongDeviceError):
         return None  # not a profile, or one of another kind of device
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 
 import cv2
 import numpy as np
@@ -119,23 +120,28 @@ def _cast(view: View, scene: Scene, heights: F64) -> tuple[F64, npt.NDArray[np.i
     origin = view.position_m
     hit_t = np.full(len(rays), np.inf)
     kind = np.zeros(len(rays), dtype=np.int8)
-    # Soil and ground: march down the ray, then halve the last step.
-    previous = np.full(len(rays), 0.2)
-    open_rays = np.arange(len(rays))
+    # Soil and ground: march down the rays from where they come below the highest soil, then halve the last step.
+    top_m = max(float(heights.max()), 0.0)  # beyond the field it is level
+    ahead, open_rays = np.ascontiguousarray(rays.T), np.arange(len(rays))
+    before = 0.2
     for t in np.arange(0.24, 3.4, 0.02):
-        p = origin + rays[open_rays] * t
-        below = p[:, 2] < _sample(heights, p[:, 0], p[:, 1])
-        found = open_rays[below]
-        if found.size:
-            low, high = previous[found], np.full(found.size, t)
-            for _ in range(7):
-                mid = (low + high) / 2
-                q = origin + rays[found] * mid[:, None]
-                under = q[:, 2] < _sample(heights, q[:, 0], q[:, 1])
-                low, high = np.where(under, low, mid), np.where(under, mid, high)
-            hit_t[found] = (low + high) / 2
-        previous[open_rays] = t
-        open_rays = open_rays[~below]
+        (low_enough,) = np.nonzero(origin[2] + ahead[2] * t < top_m)
+        if low_enough.size:
+            x, y, z = (origin[axis] + ahead[axis][low_enough] * t for axis in range(3))
+            met = low_enough[z < _sample(heights, x, y)]
+            if met.size:
+                found, ways = open_rays[met], ahead[:, met]
+                low, high = np.full(found.size, before), np.full(found.size, t)
+                for _ in range(7):
+                    mid = (low + high) / 2
+                    x, y, z = (origin[axis] + ways[axis] * mid for axis in range(3))
+                    under = z < _sample(heights, x, y)
+                    low, high = np.where(under, low, mid), np.where(under, mid, high)
+                hit_t[found] = (low + high) / 2
+                left = np.ones(open_rays.size, dtype=bool)
+                left[met] = False
+                ahead, open_rays = np.ascontiguousarray(ahead[:, left]), open_rays[left]
+        before = t
     at = origin + rays * np.where(np.isfinite(hit_t), hit_t, 0.0)[:, None]
     kind[np.isfinite(hit_t)] = 1
     kind[np.isfinite(hit_t) & (_sample(heights, at[:, 0], at[:, 1]) > 0.008)] = 2
@@ -204,11 +210,15 @@ def render(
     )
 
 
+@cache
+def _texture() -> F64:
+    fine = np.random.default_rng(5).normal(size=(512, 512))
+    return np.asarray(fine * 0.5 + cv2.GaussianBlur(fine, (0, 0), 2) * 2, dtype=np.float64)
+
+
 def _paint(view: View, scene: Scene, heights: F64, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
     _, kind, x, y = _cast(view, scene, heights)
-    texture = np.random.default_rng(5).normal(size=(512, 512))
-    texture = texture * 0.5 + cv2.GaussianBlur(texture, (0, 0), 2) * 2
-    grain = texture[(x * 200).astype(int) % 512, (y * 200).astype(int) % 512]
+    grain = _texture()[(x * 200).astype(int) % 512, (y * 200).astype(int) % 512]
     palette = np.array([(90, 80, 70), scene.ground_bgr, scene.soil_bgr, scene.blade_bgr], dtype=np.float64)
     strength = np.array([0.02, 0.10, 0.18, 0.03])[kind]
     picture = palette[kind] * (1 + strength * grain)[:, None] * np.asarray(scene.cast)

@@ -112,6 +112,8 @@ def environment(user: str) -> dict[str, str]:
     """What a login, or the unit, gives a process."""
     given = {"PATH": os.environ["PATH"], "LANG": "C.UTF-8"}
     given |= {"HOME": str(_home(user)), "USER": user, "PYTHONDONTWRITEBYTECODE": "1"}
+    if "PYTHONPYCACHEPREFIX" in os.environ:  # byte code that is there is read
+        given["PYTHONPYCACHEPREFIX"] = os.environ["PYTHONPYCACHEPREFIX"]
     if user == DAEMON:
         given |= {"STATE_DIRECTORY": str(STATE), "RUNTIME_DIRECTORY": "/run/graderd"}
     return given

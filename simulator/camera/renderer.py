@@ -11,7 +11,7 @@ import numpy.typing as npt
 from graderd.hal.camera import ColorImage, DepthImage, Intrinsics, StreamPose
 from graderd.simulator.camera.appearance import Appearance
 from graderd.simulator.camera.ground import GroundMap, SceneState, ground_map, sun_direction
-from graderd.simulator.camera.materials import Materials
+from graderd.simulator.camera.materials import Materials, materials_of
 from graderd.simulator.camera.optics import COLOR_INTRINSICS, COLOR_POSE, DEPTH_INTRINSICS, DEPTH_POSE
 from graderd.simulator.camera.paint import (
     TEXEL_M,
@@ -106,7 +106,7 @@ class Renderer:
         depth_pose: StreamPose = DEPTH_POSE,
         materials: Materials | None = None,
     ) -> None:
-        self.materials = materials or Materials(seed)
+        self.materials = materials or materials_of(seed)
         self._rng = np.random.default_rng(seed + 1)
         self._color = _Stream(COLOR_INTRINSICS.scaled(*color_size), color_pose)
         self._depth = _Stream(DEPTH_INTRINSICS.scaled(*depth_size), depth_pose) if depth_size else None

@@ -419,7 +419,7 @@ directory = "{directory}/state"
 """
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 @pytest.mark.timeout(120)
 async def test_the_daemon_drives_it_and_the_guard_blocks_it(tmp_path: Path) -> None:
     """A whole daemon with the valve in the servo's place; killed under way, the guard ends the motion."""

@@ -16,7 +16,7 @@ import pytest
 from graderd.simulator.control_client import RigControl
 from tests.machine import Machine, machine
 
-pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.whole_machine, pytest.mark.timeout(240)]
 
 
 async def start(directory: Path, *arguments: str) -> asyncio.subprocess.Process:

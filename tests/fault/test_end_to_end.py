@@ -8,7 +8,9 @@ import os
 import re
 import signal
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,13 @@ from graderd.simulator.control_client import RigControl
 from tests.machine import READY_S, machine, start_rig
 
 pytestmark = pytest.mark.timeout(240)
+
+
+@pytest.fixture
+def short_path() -> Iterator[Path]:
+    """A folder whose name leaves a socket's name its room, as a worker's ``tmp_path`` does not."""
+    with tempfile.TemporaryDirectory(prefix="graderd-test-") as folder:
+        yield Path(folder)
 
 
 async def test_the_demonstration_turns_the_blade_by_what_the_camera_sees() -> None:
@@ -37,10 +46,10 @@ async def test_the_demonstration_turns_the_blade_by_what_the_camera_sees() -> No
         assert measured_deg == pytest.approx(requested_deg, abs=0.5)
 
 
-@pytest.mark.serial_only  # a worker's folders are too long for a socket's name
-async def test_two_demonstrations_beside_each_other_pass(tmp_path: Path) -> None:
+@pytest.mark.whole_machine
+async def test_two_demonstrations_beside_each_other_pass(short_path: Path) -> None:
     """Two checkouts, or two users: nothing of one is the other's, whatever the place for run-time files."""
-    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(short_path)}
     demonstrations = [
         await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "graderd", "demo", "--json"), stdout=asyncio.subprocess.PIPE, env=environment
@@ -51,20 +60,20 @@ async def test_two_demonstrations_beside_each_other_pass(tmp_path: Path) -> None
         last = json.loads(out.splitlines()[-1])
         assert [one["decided"] for one in last["passes"]] == ["left", "center", "right", "even"], last
     assert [process.returncode for process in demonstrations] == [0, 0]
-    assert list(tmp_path.iterdir()) == []
+    assert list(short_path.iterdir()) == []
 
 
-@pytest.mark.serial_only  # a worker's folders are too long for a socket's name
-async def test_a_demonstration_that_fails_says_why_in_its_last_event(tmp_path: Path) -> None:
+@pytest.mark.whole_machine
+async def test_a_demonstration_that_fails_says_why_in_its_last_event(short_path: Path) -> None:
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "graderd", "demo", "--json"),
         stdout=asyncio.subprocess.PIPE,
-        env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},
+        env={**os.environ, "XDG_RUNTIME_DIR": str(short_path)},
     )
     assert process.stdout is not None
     while json.loads(await process.stdout.readline())["event"] != "armed":
         pass
-    (directory,) = tmp_path.iterdir()
+    (directory,) = short_path.iterdir()
     os.kill(json.loads((directory / "rig.json").read_text())["pid"], signal.SIGKILL)
     out, _ = await process.communicate()
     last = json.loads(out.splitlines()[-1])
@@ -73,15 +82,15 @@ async def test_a_demonstration_that_fails_says_why_in_its_last_event(tmp_path: P
     assert last["passes"] == []
     # Whoever notices first: the demonstration, which asks the rig, or the daemon, whose devices are gone.
     assert re.search(r"control\.sock|\w+\.(unplugged|no_reply|no_feedback|missing)", last["reason"]), last
-    assert list(tmp_path.iterdir()) == []
+    assert list(short_path.iterdir()) == []
 
 
-@pytest.mark.serial_only  # a worker's folders are too long for a socket's name
-async def test_a_demonstration_ended_from_outside_says_so_and_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.whole_machine
+async def test_a_demonstration_ended_from_outside_says_so_and_leaves_nothing(short_path: Path) -> None:
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "graderd", "demo", "--json"),
         stdout=asyncio.subprocess.PIPE,
-        env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},
+        env={**os.environ, "XDG_RUNTIME_DIR": str(short_path)},
     )
     assert process.stdout is not None
     while json.loads(await process.stdout.readline()) != {"event": "starting", "what": "daemon"}:
@@ -90,10 +99,10 @@ async def test_a_demonstration_ended_from_outside_says_so_and_leaves_nothing(tmp
     out, _ = await process.communicate()
     assert json.loads(out.splitlines()[-1]) == {"event": "demo_finished", "passes": [], "reason": "ended by SIGTERM"}
     assert process.returncode == 1
-    assert list(tmp_path.iterdir()) == []
+    assert list(short_path.iterdir()) == []
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 async def test_the_servo_stops_by_its_own_watchdog_when_the_daemon_is_killed(tmp_path: Path) -> None:
     async with machine(tmp_path) as whole:
         await whole.turn()
@@ -117,7 +126,7 @@ async def test_the_servo_stops_by_its_own_watchdog_when_the_daemon_is_killed(tmp
         assert stopped_s < 2.0
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 async def test_a_dead_rig_is_named_held_and_back_in_standby_when_it_returns(tmp_path: Path) -> None:
     async with machine(tmp_path) as whole:
         await whole.turn()
@@ -137,7 +146,7 @@ async def test_a_dead_rig_is_named_held_and_back_in_standby_when_it_returns(tmp_
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 async def test_a_signal_in_mid_turn_ends_everything_within_two_seconds(tmp_path: Path, number: signal.Signals) -> None:
     async with machine(tmp_path) as whole:
         await whole.turn()
@@ -152,7 +161,7 @@ async def test_a_signal_in_mid_turn_ends_everything_within_two_seconds(tmp_path:
         assert not (tmp_path / "graderd.sock").exists()
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 async def test_a_second_daemon_on_the_same_socket_says_so_and_disturbs_nothing(tmp_path: Path) -> None:
     async with machine(tmp_path) as whole:
         await whole.until(lambda s: all(a.lifecycle == "standby" for a in s.axes.values()))

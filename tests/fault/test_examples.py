@@ -10,7 +10,7 @@ import pytest
 
 from tests.machine import machine
 
-pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.whole_machine, pytest.mark.timeout(240)]
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 

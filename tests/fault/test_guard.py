@@ -150,7 +150,7 @@ def _send(can_wire: VirtualActuatorBus, name: str, address: int, *, enable: bool
     can_wire.send(Frame(make_id(3, Pgn.PROPRIETARY_A, 0xE7, address), data))
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 @pytest.mark.timeout(180)
 async def test_the_guard_after_a_daemon_that_was_killed_in_mid_lift(tmp_path: Path) -> None:
     configure(tmp_path)

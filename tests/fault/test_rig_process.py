@@ -19,7 +19,7 @@ from graderd.hal.settings import CameraSettings
 from graderd.simulator.control_client import rig_request
 from tests.rig_process import running_rig
 
-pytestmark = pytest.mark.serial_only
+pytestmark = pytest.mark.whole_machine
 
 
 def alive(pid: int) -> bool:

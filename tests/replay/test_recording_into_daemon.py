@@ -13,7 +13,7 @@ from graderd.simulator.control_client import RigControl
 from harness.realsense_devices import SoftD455, record
 from tests.machine import machine, start_rig
 
-pytestmark = [pytest.mark.serial_only, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.whole_machine, pytest.mark.timeout(240)]
 FRAMES_N = 30
 
 

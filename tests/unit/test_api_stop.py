@@ -21,6 +21,7 @@ from graderd.core.machine import Mode
 from harness.api_daemon import serving, within
 from tests.unit.test_api_sockets import connect
 
+pytestmark = pytest.mark.live
 LONG = "x" * 20_000
 BODIES = {
     "nothing": b"",

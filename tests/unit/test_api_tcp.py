@@ -259,7 +259,7 @@ async def test_a_stranger_who_hangs_on_is_let_go_and_does_not_keep_the_daemon(
     assert caplog.records == []
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 async def test_a_flood_of_strangers_leaves_the_tick_its_time(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     tcp = tcp_settings(tmp_path)
     async with serving(tmp_path, tcp=tcp) as (daemon, _), longest_hold() as hold:
@@ -277,7 +277,7 @@ async def test_a_flood_of_strangers_leaves_the_tick_its_time(tmp_path: Path, cap
     assert caplog.records == []
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 @pytest.mark.parametrize("wire", ["tcp", "unix"])
 async def test_30_000_stops_on_the_jog_socket(tmp_path: Path, wire: str, caplog: pytest.LogCaptureFixture) -> None:
     tcp = tcp_settings(tmp_path)
@@ -298,7 +298,7 @@ async def test_30_000_stops_on_the_jog_socket(tmp_path: Path, wire: str, caplog:
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 @pytest.mark.parametrize("wire", ["tcp", "unix"])
 @pytest.mark.parametrize("stream", ["/v1/stream", "/v1/jog"])
 async def test_a_flood_of_pings_costs_neither_time_nor_memory_nor_log(

@@ -98,6 +98,7 @@ def test_other_lines_are_passed_over(line: str) -> None:
     assert json.loads(out.getvalue())["kind"] == "read"
 
 
+@pytest.mark.live
 def test_a_file_and_standard_input_are_read_alike(tmp_path: Path) -> None:
     log = tmp_path / "servo.log"
     log.write_text(wire_line(1.0, "tx", ASK) + "\n# 1 lines lost\n" + wire_line(1.01, "rx", ANSWER) + "\n")

@@ -48,6 +48,7 @@ def tree(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.live
 @pytest.mark.parametrize(
     ("new", "verdict", "by"), [("return a - b", "killed", "test_sum"), ("return a * b", "survived", "")]
 )
@@ -61,6 +62,7 @@ def test_a_mistake_that_no_test_notices_is_a_survivor_and_the_tree_is_put_back(
     assert f"| m | `sums.py` | sums are wrong | {verdict} | " in table([result])
 
 
+@pytest.mark.live
 def test_tests_that_do_not_run_are_no_verdict(tree: Path) -> None:
     (tree / "test_sums.py").write_text("def test_another(): pass\n")
     assert "pytest ended with 4" in try_mutant(tree, seeded("return 0")).verdict
@@ -76,6 +78,7 @@ def test_a_text_or_test_that_is_not_there_is_told(tree: Path) -> None:
     assert misfit(seeded(""), tree) == "its file is not there"
 
 
+@pytest.mark.live
 def test_the_copy_keeps_links_and_leaves_what_git_ignores(tmp_path: Path) -> None:
     copy_tree(tmp_path)
     assert (tmp_path / "graderd/drivers").is_symlink()

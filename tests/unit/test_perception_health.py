@@ -25,6 +25,8 @@ from graderd.simulator.grader.piles import SceneZone
 from graderd.simulator.grader.world import World, scene_heights
 from harness.perception_scenes import PoseError, Scene, render
 
+pytestmark = pytest.mark.slow
+
 ANGLE_DEG = 10.0
 
 

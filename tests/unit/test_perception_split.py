@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -90,6 +92,7 @@ def test_what_lies_beyond_the_travel_looked_ahead_does_not_count() -> None:
     assert sum(split(0.1 * ((travel_m > TRAVEL_M + 0.01) & (S < 2.0)), angle_deg)[1]) == 0.0
 
 
+@pytest.mark.xdist_group("pictures before a turned blade")
 @pytest.mark.parametrize("method", ["depth", "fused"])
 @pytest.mark.parametrize("angle_deg", [-45.0, -30.0, 0.0, 30.0, 45.0])
 @pytest.mark.parametrize("zone", [Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN])
@@ -103,6 +106,13 @@ def test_what_a_turned_blade_will_meet_is_told_from_the_picture(zone: Zone, angl
 
 
 def look(zone: Zone, angle_deg: float, method: Method = "depth") -> SoilObservation:
+    classifier = make_classifier(PerceptionSettings(method=method), CameraCalibration(), BLADE, live=False)
+    return classifier.classify(picture(zone, angle_deg), angle_deg, 0.01, MeasuredAttitude(2.0, 0.0, 0.0))
+
+
+@cache
+def picture(zone: Zone, angle_deg: float) -> Frame:
+    """Of the heap before a blade that was pushed against it; made once for all methods."""
     world = World()
     world.blade = BladePose(angle_deg)
     world.lay(scene_heights(SceneZone(zone), world.vehicle.x_m, world.blade, 2))
@@ -111,9 +121,7 @@ def look(zone: Zone, angle_deg: float, method: Method = "depth") -> SoilObservat
     renderer = Renderer((640, 400), (424, 240), seed=3)
     seen = SceneState(world.field.heights_m.astype(np.float32), world.field.cell_m, world.vehicle.x_m, world.blade)
     color, depth = renderer.render(seen, Appearance())
-    frame = Frame(color, depth, renderer.color_intrinsics, renderer.depth_intrinsics, 0.0)
-    classifier = make_classifier(PerceptionSettings(method=method), CameraCalibration(), BLADE, live=False)
-    return classifier.classify(frame, angle_deg, 0.01, MeasuredAttitude(2.0, 0.0, 0.0))
+    return Frame(color, depth, renderer.color_intrinsics, renderer.depth_intrinsics, 0.0)
 
 
 @pytest.mark.parametrize("method", ["paper", "fast_color"])

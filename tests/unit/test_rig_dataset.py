@@ -16,13 +16,14 @@ import pytest
 from graderd.perception.frame_set import FrameSet
 from graderd.simulator import dataset
 from graderd.simulator.camera.ground import SceneState
-from graderd.simulator.camera.materials import Materials
+from graderd.simulator.camera.materials import materials_of
 from graderd.simulator.camera.optics import COLOR_POSE, DEPTH_INTRINSICS, knocked
 from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.blade import volumes_in_front_m3
 from graderd.simulator.scenes import label_of, random_scene
 
-pytestmark = pytest.mark.xdist_group("rig dataset")  # one set of pictures for all
+# One set of pictures for all.
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("rig dataset")]
 
 SCENES = 6
 
@@ -125,7 +126,7 @@ def test_rig_scenes_vary_and_repeat() -> None:
 
 def test_rig_set_depth_shows_the_volumes_it_is_labelled_with() -> None:
     """Re-measured from noise-free depth and the scene's true pose, by nothing that the renderer shares."""
-    materials = Materials(0)
+    materials = materials_of(0)
     checked = 0
     for number in (0, 1, 2, 3):
         scene = random_scene(21, number)

@@ -11,7 +11,7 @@ import pytest
 from graderd.hal.camera import Intrinsics, StreamPose
 from graderd.simulator.camera.appearance import Appearance
 from graderd.simulator.camera.ground import SceneState
-from graderd.simulator.camera.materials import Materials
+from graderd.simulator.camera.materials import Materials, materials_of
 from graderd.simulator.camera.optics import (
     COLOR_INTRINSICS,
     COLOR_POSE,
@@ -34,7 +34,7 @@ COLOR_SIZE, DEPTH_SIZE = (320, 200), (424, 240)
 
 @pytest.fixture(scope="module")
 def materials() -> Materials:
-    return Materials(0)
+    return materials_of(0)
 
 
 def state_of(field: SoilField, x_m: float = 3.0, blade: BladePose | None = None, *props: Solid) -> SceneState:
@@ -177,7 +177,7 @@ def test_rig_pictures_repeat_by_seed(materials: Materials) -> None:
     lay_scene(field, SceneZone.LEFT, 3.0, BladePose(), seed=4)
 
     def film(seed: int) -> list[npt.NDArray[np.uint8]]:
-        renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, seed=seed)
+        renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, seed=seed, materials=Materials(seed))
         pictures: list[npt.NDArray[np.uint8]] = []
         for _ in range(2):
             color, depth = renderer.render(state_of(field), Appearance())

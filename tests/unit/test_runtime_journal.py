@@ -265,6 +265,7 @@ def test_a_pipe_that_nobody_reads_is_not_waited_for_and_what_was_lost_is_told(mo
     logging.getLogger().handlers.clear()
 
 
+@pytest.mark.live
 def test_a_process_whose_standard_error_nobody_reads_ends(tmp_path: Path) -> None:
     del tmp_path
     code = (

@@ -15,19 +15,21 @@ from graderd.perception.classifier import make_classifier
 from graderd.runtime.control import tick_settings
 from graderd.simulator.camera.appearance import Appearance
 from graderd.simulator.camera.ground import SceneState
-from graderd.simulator.camera.materials import Materials
+from graderd.simulator.camera.materials import materials_of
 from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.piles import SceneZone
 from graderd.simulator.grader.world import World, scene_heights
 from harness.passes import DRIVE_M, ON_GROUND, Case, LoopPass, fixed_width_mm, loop_config, loop_pass
 
+pytestmark = pytest.mark.slow
+
 CONFIG = loop_config()
 
 
 def test_a_heap_dead_ahead_of_a_blade_at_45_degrees_is_center() -> None:
     """It lies before the right third, square to the blade; the blade swung 75 degrees across the pile."""
-    one = LoopPass(Case("center", 45.0, 0.5, 2), tick_settings(CONFIG), CONFIG, Materials(0))
+    one = LoopPass(Case("center", 45.0, 0.5, 2), tick_settings(CONFIG), CONFIG, materials_of(0))
     decisions = [tick.state.decision for tick in islice(one.ticks(), 60)]
     assert {decision.zone for decision in decisions} == {None, Zone.CENTER}
     assert decisions[-1].angle_deg == 15.0
@@ -36,7 +38,7 @@ def test_a_heap_dead_ahead_of_a_blade_at_45_degrees_is_center() -> None:
 @pytest.mark.parametrize("start_deg", [-30.0, 45.0])
 def test_a_center_pile_keeps_its_angle_and_is_spread_as_by_a_fixed_blade(start_deg: float) -> None:
     """Carried it spreads over the whole blade; deciding again on that ended at 45 degrees, a fifth narrower."""
-    outcome = loop_pass(Case("center", start_deg, 1.0, 1), CONFIG, Materials(0))
+    outcome = loop_pass(Case("center", start_deg, 1.0, 1), CONFIG, materials_of(0))
     assert outcome.decisions == ("center",)
     assert outcome.note == ""
     assert outcome.angle_deg == pytest.approx(15.0, abs=0.5)
@@ -55,7 +57,7 @@ def test_what_a_blade_carries_is_no_person_and_no_knocked_camera(
     world.blade = BladePose(angle_deg)
     world.lay(scene_heights(zone, world.vehicle.x_m, world.blade, 1))
     world.vehicle.drive(speed_m_per_s, DRIVE_M)
-    renderer = Renderer((640, 400), (424, 240), seed=1, materials=Materials(0))
+    renderer = Renderer((640, 400), (424, 240), seed=1, materials=materials_of(0))
     judge = make_classifier(PerceptionSettings(), CameraCalibration(), BladeGeometry(), live=False)
     seen = 0
     while world.vehicle.travelled_m < to_m:

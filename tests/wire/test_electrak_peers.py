@@ -168,7 +168,7 @@ async def read_line(stream: asyncio.StreamReader) -> dict[str, Any]:
         return json.loads(await stream.readline())  # type: ignore[no-any-return]
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 async def test_the_virtual_actuators_run_alone_and_take_faults_on_standard_input(tmp_path: Path) -> None:
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "graderd.simulator.actuators", "--link", str(tmp_path / "can"),
