@@ -82,6 +82,23 @@ def rewrite(path: Path, change: Callable[[str], str], *, create: bool = False) -
         return None if backup is None else place.target.with_name(backup)
 
 
+def backups_of(path: Path) -> list[Path]:
+    """The backups beside a configuration file, the oldest first (as text, the tenth of a second comes before the
+    second, and both before the first).
+
+    Raises:
+        OSError: the directory cannot be read.
+    """
+    return [path.with_name(name) for _, _, name in _dated(path.name, os.listdir(path.parent))]
+
+
+def _dated(name: str, beside: list[str]) -> list[tuple[str, int, str]]:
+    """Date, number within its second, and name of each backup of ``name``, the oldest first."""
+    ours = re.compile(re.escape(f"{name}.") + r"(\d{8}-\d{6})(?:-(\d{1,9}))?\.bak")
+    matches = (ours.fullmatch(found) for found in beside)
+    return sorted((match[1], int(match[2] or 1), match[0]) for match in matches if match)
+
+
 def check_rights(path: Path) -> None:
     """Try all that :func:`rewrite` needs (of a file that may be new) and change nothing: ask before a long work.
 
@@ -191,10 +208,7 @@ class _Place:
         self.remove(*others[: max(0, len(others) - BACKUPS_N + 1)])
 
     def _backups(self) -> list[tuple[str, int, str]]:
-        """Date, number within its second, and name of each, the oldest first."""
-        ours = re.compile(re.escape(f"{self.name}.") + r"(\d{8}-\d{6})(?:-(\d{1,9}))?\.bak")
-        matches = (ours.fullmatch(name) for name in os.listdir(self.directory))
-        return sorted((match[1], int(match[2] or 1), match[0]) for match in matches if match)
+        return _dated(self.name, os.listdir(self.directory))
 
 
 @contextmanager

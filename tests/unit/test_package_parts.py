@@ -123,3 +123,23 @@ def test_installing_asks_anew_only_for_devices_the_rules_are_about(tmp_path: Pat
         "trigger|--action=add|--subsystem-match=tty|--property-match=ID_MODEL_ID=6014|"
         "--property-match=ID_SERIAL_SHORT=FT1234|--property-match=ID_SERIAL_SHORT=003B0034|",
     ]
+
+
+def test_the_newest_backup_that_this_version_can_use_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of several in one second, too, whose names are in no order as text."""
+    for name, text in (
+        ("", ""),
+        ("-2", ""),
+        ("-9", ""),
+        ("-10", "[blade]\nlength_m = 1.1\n"),
+        ("-11", "version = 99\n"),
+    ):
+        (tmp_path / f"graderd.toml.20260102-000000{name}.bak").write_text(text, encoding="utf-8")
+    (tmp_path / "graderd.toml.20260101-235959.bak").touch()
+    (tmp_path / "graderd.toml.9.bak").write_text("somebody's own", encoding="utf-8")
+    asked = POSTINST.read_text(encoding="utf-8").split("usable_backup() {")[1].split("<<'END'\n")[1].split("END\n")[0]
+    assert asked.count('"/etc/graderd/graderd.toml"') == 1
+    exec(asked.replace('"/etc/graderd/graderd.toml"', repr(str(tmp_path / "graderd.toml"))), {})
+    assert capsys.readouterr().out == f"{tmp_path}/graderd.toml.20260102-000000-10.bak\n"
