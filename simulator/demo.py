@@ -29,6 +29,10 @@ POLL_S = 0.05
 STALLED_S = 60.0
 """What is waited for may take as long as it gets on. A machine busy with other things is slow: it is not broken."""
 DECISION_FRAMES_N = 300
+ATTEMPTS_N = 5
+RECOVERY_S = 5.0
+"""A pass that the machine broke off is driven anew, so often, once the machine has been without faults within this
+time. A busy machine starves its own servo's watchdog or its camera; what is broken stays broken."""
 SETTLED_DEG = 0.5
 SETTLED_FOR_S = 0.5
 DRIVE_M = 3.0
@@ -71,9 +75,8 @@ async def _demo(show: Show) -> int:
             RigControl(directory / "control.sock") as control,
         ):
             demo = _Demo(client, control, show)
-            await demo.arm()
             for zone in ZONES:
-                passes.append(await demo.one_pass(zone))
+                passes.append(await demo.drive_pass(zone))
             await client.command("disarm")
         wrong = [p for p in passes if p.zone != p.decided]
         reason = "; ".join(f"soil {p.zone} was taken for {p.decided}" for p in wrong)
@@ -212,6 +215,31 @@ class _Demo:
         except RefusedError as error:
             status = await self.status()
             raise DemoFailedError(f"{error}; {status.mode}: {status.reason}") from None
+
+    async def drive_pass(self, zone: str) -> Pass:
+        """One pass; anew where the machine stepped back from it by itself and has nothing any more that keeps it."""
+        attempt_n = 1
+        while True:
+            try:
+                if (await self.status()).mode == "disarmed":
+                    await self.arm()
+                return await self.one_pass(zone)
+            except (DemoFailedError, ClientError) as error:
+                if attempt_n == ATTEMPTS_N or not await self._stepped_back():
+                    raise
+                self._show.event("again", scene=zone, reason=str(error))
+                attempt_n += 1
+
+    async def _stepped_back(self) -> bool:
+        """Whether it is disarmed, or manual, without a stop, and free of faults within ``RECOVERY_S``."""
+        deadline_s = time.monotonic() + RECOVERY_S
+        while (status := await self.status()).mode in ("disarmed", "manual"):
+            if not any(fault.present for fault in status.faults):
+                return True
+            if time.monotonic() > deadline_s:
+                break
+            await asyncio.sleep(POLL_S)
+        return False
 
     async def one_pass(self, zone: str) -> Pass:
         """Square blade, new soil, automatic operation, settle, drive."""

@@ -12,7 +12,9 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import psutil
 import pytest
 
 from graderd.client import RefusedError
@@ -83,6 +85,39 @@ async def test_a_demonstration_that_fails_says_why_in_its_last_event(short_path:
     # Whoever notices first: the demonstration, which asks the rig, or the daemon, whose devices are gone.
     assert re.search(r"control\.sock|\w+\.(unplugged|no_reply|no_feedback|missing)", last["reason"]), last
     assert list(short_path.iterdir()) == []
+
+
+@pytest.mark.whole_machine
+async def test_a_pass_that_a_busy_machine_broke_off_is_driven_anew() -> None:
+    """A daemon without a processor: the servo's own watchdog ends motion, and the daemon disarms when it sees why."""
+    demo = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "graderd", "demo", "--json"), stdout=asyncio.subprocess.PIPE
+    )
+    assert demo.stdout is not None
+    events: list[str] = []
+
+    async def until(wanted: str) -> dict[str, Any]:
+        while True:
+            event: dict[str, Any] = json.loads(await demo.stdout.readline())  # type: ignore[union-attr]
+            events.append(event["event"])
+            assert "demo_finished" not in events, event
+            if event["event"] == wanted:
+                return event
+
+    try:
+        await until("decision")
+        (daemon,) = (one for one in psutil.Process(demo.pid).children() if "run" in one.cmdline())
+        daemon.suspend()
+        await asyncio.sleep(0.6)
+        daemon.resume()
+        again = await until("again")
+        assert again["scene"] == "left"
+        assert "disarmed" in again["reason"]
+        assert (await until("settled"))["zone"] == "left"
+        assert events.count("armed") == 2
+    finally:
+        demo.send_signal(signal.SIGINT)
+        await demo.communicate()
 
 
 @pytest.mark.whole_machine
