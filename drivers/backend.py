@@ -48,9 +48,10 @@ class RotatorBackend(Generic[RotatorS, RotatorD]):
     """A driver of the blade's rotation.
 
     ``build`` returns it closed. ``safe_off`` ends motion without a daemon and without the driver: a synchronous
-    function that opens the wire anew, takes a second at most, returns a line for the log and raises ``DeviceError``
-    where it could not reach the device. ``services``: by name, without the axis. ``buses``: wires of its own that can
-    be watched, by the name that they have for clients.
+    function that opens the wire anew, returns a line for the log and raises ``DeviceError`` where it could not reach
+    the device. It runs in a thread beside the other drivers', has told the device within a second, and stays longer
+    only where an adapter boots when it is opened. ``services``: by name, without the axis. ``buses``: wires of its own
+    that can be watched, by the name that they have for clients.
     """
 
     settings: type[RotatorS]

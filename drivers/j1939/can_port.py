@@ -266,7 +266,9 @@ def open_port(settings: CanSettings, *, fd: bool = False) -> BusPort:
     try:
         if settings.interface == "socketcan":
             _check_interface(where, settings.channel)
-            return SocketCanPort(SocketcanBus(channel=settings.channel, fd=fd))
+            bus = SocketcanBus(channel=settings.channel, fd=fd)
+            # python-can's own reader fails at a count of dropped frames, which SocketCanPort asks the kernel for.
+            return BusPort(bus) if fd else SocketCanPort(bus)
         return SlcanPort(QuietSlcanBus(settings.channel, settings.bitrate_n))
     except (can.CanError, OSError, ValueError) as error:
         remedy = "Is the adapter plugged in, and may this user open it (group dialout)?"

@@ -232,6 +232,8 @@ SERVO = (
 
 CAN = (
     _can("unplug", "the adapter is pulled and put back", "unplugged", actuator("unplug"), short=(LIFTING,)),
+    _can("adapter_refuses", "the adapter answers NACK to every frame", "adapter_refuses", actuator("adapter_refuses"),
+         short=(LIFTING,)),
     _can("bus_off", "the controller leaves the bus", "bus_off", actuator("bus_off"), short=(LIFTING,)),
     _can("error_passive", "128 errors counted", "error_passive", actuator("error_passive")),
     _can("overrun", "received frames were lost", "queue_overrun", actuator("overrun")),

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
+import socket
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -13,14 +16,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graderd.drivers.electrak.dump import DecodedFrame, FrameDecoder, dump, main, text_of
+from graderd.drivers.electrak import dump as electrak_dump
+from graderd.drivers.electrak.dump import DecodedFrame, FrameDecoder, dump, main, read_live, text_of
+from graderd.drivers.j1939 import can_port
 from graderd.drivers.j1939.bus_health import BusEvent
 from graderd.drivers.j1939.can_logs import candump_line, parse_candump_line, read_file
+from graderd.drivers.j1939.can_port import BusPort, open_port
 from graderd.drivers.j1939.dm1 import dtc_of, encode
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id
-from graderd.drivers.j1939.python_can import can
+from graderd.drivers.j1939.python_can import SocketcanBus, can
 from graderd.drivers.j1939.transport import Transport
 from graderd.hal.errors import ProtocolError
+from graderd.hal.settings import CanSettings
 
 FRAMES = [
     (0.0, Frame(0x18EF1300, bytes.fromhex("DC05191500000000"))),
@@ -233,6 +240,63 @@ def test_error_remote_and_fd_frames_are_told_as_what_they_are(line: str, kind: s
     assert told["data"] == data or not data
     assert told["name"] not in ("ACM", "AFM")
     assert {"error": "error", "remote": "remote", "fd": "CAN FD"}[kind] in text_of(told)
+
+
+# -- live: a reader of python-can's messages, and the kernel's own structures
+
+
+def kinds_of_a_live_bus(monkeypatch: pytest.MonkeyPatch, port: BusPort, frames_n: int) -> list[dict[str, Any]]:
+    """What ``graderd can dump CHANNEL`` prints of the next frames."""
+    monkeypatch.setattr(electrak_dump, "open_port", lambda *_, **__: port)
+    live = read_live("can0")
+    out = io.StringIO()
+    dump(itertools.islice(live, frames_n), out, as_json=True)
+    live.close()  # type: ignore[attr-defined]
+    return [json.loads(line) for line in out.getvalue().splitlines()]
+
+
+def test_live_remote_error_and_fd_frames_are_told_as_what_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = can.Bus(interface="virtual", channel="live")
+    port = BusPort(can.Bus(interface="virtual", channel="live"))
+    try:
+        bus.send(message(FRAMES[0][1], 0.0))
+        bus.send(can.Message(arbitration_id=0x18EA13E7, is_remote_frame=True, dlc=3))
+        bus.send(can.Message(arbitration_id=0x40, is_error_frame=True, is_extended_id=False, data=bytes(8)))
+        bus.send(can.Message(arbitration_id=0x18EF13E7, is_fd=True, data=bytes(range(12))))
+        told = kinds_of_a_live_bus(monkeypatch, port, 4)
+    finally:
+        bus.shutdown()
+    assert [each["kind"] for each in told] == ["data", "remote", "error", "fd"]
+    assert told[0]["signals"] == ACM
+    assert told[1]["name"] == "remote request for request"
+    assert told[2]["signals"]["state"] == "bus_off"
+    assert told[3]["data"] == bytes(range(12)).hex().upper()
+
+
+def test_the_kernels_frames_are_told_as_what_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``struct can_frame`` and ``canfd_frame`` as SocketCAN hands them out, through python-can's own reader of them."""
+    ours, kernel = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    ours.setsockopt(socket.SOL_SOCKET, 35, 1)  # SO_TIMESTAMPNS, as python-can asks for
+    bus = SocketcanBus.__new__(SocketcanBus)
+    bus.__dict__.update(socket=ours, channel="can0", _is_filtered=False, _filters=None, _is_shutdown=False)
+    bus.__dict__.update(_bcm_sockets={}, _periodic_tasks=[], _task_id=0)
+    monkeypatch.setattr(can_port, "_check_interface", lambda *_: None)
+    monkeypatch.setattr(can_port, "SocketcanBus", lambda **_: bus)
+    port = open_port(CanSettings(interface="socketcan", channel="can0"), fd=True)
+    assert not ours.getsockopt(socket.SOL_SOCKET, 40), (
+        "SO_RXQ_OVFL: python-can's reader takes no second control message"
+    )
+    classic, flexible = struct.Struct("=IB3x8s"), struct.Struct("=IBB2x64s")
+    kernel.send(classic.pack(0x8000_0000 | 0x18EF1300, 8, FRAMES[0][1].data))
+    kernel.send(classic.pack(0xC000_0000 | 0x18EA13E7, 3, b""))
+    kernel.send(classic.pack(0x2000_0000 | 0x04, 8, bytes((0, 0x30, 0, 0, 0, 0, 128, 128))))
+    kernel.send(flexible.pack(0x8000_0000 | 0x18EF13E7, 12, 1, bytes(range(12))))
+    told = kinds_of_a_live_bus(monkeypatch, port, 4)
+    kernel.close()
+    assert [each["kind"] for each in told] == ["data", "remote", "error", "fd"]
+    assert told[0]["signals"] == ACM
+    assert told[2]["signals"] == {"errors": ["controller"], "state": "error_passive"}
+    assert told[3]["data"] == bytes(range(12)).hex().upper()
 
 
 def test_error_frames_say_what_is_wrong() -> None:

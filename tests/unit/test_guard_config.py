@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,6 +12,7 @@ import pytest
 from graderd import places
 from graderd.cli.app import run_app
 from graderd.config import Config, load, parse
+from graderd.hal.errors import DeviceMissingError
 from graderd.hal.settings import Ph54Settings
 from graderd.runtime.app import guard
 from graderd.runtime.app.last_run import FILE, is_of, recall, remember
@@ -172,3 +175,46 @@ def test_a_failure_nobody_thought_of_leaves_the_other_wire(
     assert guard.make_safe(Config()) == 1
     assert "guard: rotation: torque off" in caplog.text
     assert '{"failed": ["lift_left, lift_right, tilt"]}' in caplog.text
+
+
+def _drivers(monkeypatch: pytest.MonkeyPatch, rotation: Callable[[], str], actuators: Callable[[], str]) -> None:
+    drivers = [SimpleNamespace(safe_off=lambda *_, told=told: told()) for told in (rotation, actuators)]
+    monkeypatch.setattr(guard, "rotator_of", lambda settings: (drivers[0], settings))
+    monkeypatch.setattr(guard, "actuator_of", lambda _, settings: (drivers[1], settings))
+
+
+def test_no_wire_waits_for_anothers_adapter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each ends when the other has begun: one after the other, neither would end."""
+    rotation_began, actuators_began = threading.Event(), threading.Event()
+
+    def rotation() -> str:
+        rotation_began.set()
+        assert actuators_began.wait(5.0), "it waited for the rotation"
+        return "torque off"
+
+    def actuators() -> str:
+        actuators_began.set()
+        assert rotation_began.wait(5.0), "it waited for the actuators"
+        return "motion disabled"
+
+    _drivers(monkeypatch, rotation, actuators)
+    assert guard.make_safe(Config()) == 0
+
+
+def test_two_drivers_on_an_adapter_that_takes_one_at_a_time_are_both_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken, refused = threading.Event(), threading.Event()
+
+    def actuators() -> str:
+        taken.set()
+        assert refused.wait(5.0)
+        return "motion disabled"
+
+    def rotation() -> str:
+        assert taken.wait(5.0)
+        if refused.is_set():
+            return "valve blocked"
+        refused.set()
+        raise DeviceMissingError("adapter", "another program has it open")
+
+    _drivers(monkeypatch, rotation, actuators)
+    assert guard.make_safe(Config()) == 0

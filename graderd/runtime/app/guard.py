@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -48,21 +49,29 @@ def config_to_act_on(config_path: Path | None) -> Config:
 def make_safe(config: Config) -> int:
     """Every driver's own safe-off: motion disabled on the CAN bus, the servo as ``rotation.torque_at_exit`` says.
 
-    The wires do not wait for each other's success. Returns 0 if all were told, else 1.
+    The wires do not wait for each other: all at once, since one adapter may boot for seconds. What failed is tried once
+    more when the others are done, in case two drivers share an adapter that takes one at a time. Returns 0 if all were
+    told, else 1.
     """
-    failed = []
-    for name, action in _actions(config).items():
-        try:
-            log.info("guard: %s: %s", name, action())
-        except DeviceError as error:
-            failed.append(name)
-            log.error("guard: %s: %s", name, error)
-        except Exception:
-            # Whatever one driver raises, a mistake of ours among it, is no reason to leave the next.
-            failed.append(name)
-            log.exception("guard: %s", name)
+    actions = _actions(config)
+    with ThreadPoolExecutor(len(actions)) as threads:
+        done = dict(zip(actions, threads.map(_told, actions, actions.values()), strict=True))
+    failed = [name for name, told in done.items() if not told and not _told(name, actions[name])]
     log.info("guard: %s", json.dumps({"failed": failed}))
     return 1 if failed else 0
+
+
+def _told(name: str, action: Callable[[], str]) -> bool:
+    try:
+        log.info("guard: %s: %s", name, action())
+    except DeviceError as error:
+        log.error("guard: %s: %s", name, error)
+        return False
+    except Exception:
+        # Whatever one driver raises, a mistake of ours among it, is no reason to leave the next.
+        log.exception("guard: %s", name)
+        return False
+    return True
 
 
 def _actions(config: Config) -> dict[str, Callable[[], str]]:
