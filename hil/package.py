@@ -116,11 +116,9 @@ def newer_version(package: Path, directory: Path) -> Path:
     lines = [f"Version: {NEWER}" if line.startswith("Version:") else line for line in control.read_text().splitlines()]
     control.write_text("\n".join(lines) + "\n", encoding="utf-8")
     config = tree / "opt" / "graderd" / "lib" / "common" / "graderd" / "config"
-    substitute(config / "models.py", "version: Literal[1] = 1", "version: Literal[2] = 2")
-    step = "{1: lambda document: rename(document, 'yard.zero_deg', 'rotation.zero_deg')}"
-    substitute(
-        config / "migrate.py", "STEPS: Final[Mapping[int, Step]] = {}", f"STEPS: Final[Mapping[int, Step]] = {step}"
-    )
+    substitute(config / "models.py", "version: Literal[2] = 2", "version: Literal[3] = 3")
+    step = "2: lambda document: rename(document, 'yard.zero_deg', 'rotation.zero_deg')"
+    substitute(config / "migrate.py", "Mapping[int, Step]] = {1: _to_2}", f"Mapping[int, Step]] = {{1: _to_2, {step}}}")
     (tree / "DEBIAN" / "md5sums").unlink()  # dpkg makes its own where a package has none
     result = tree.with_suffix(".deb")
     subprocess.run(["dpkg-deb", "--root-owner-group", "-Zzstd", "-z1", "--build", tree, result], check=True, stdout=-3)

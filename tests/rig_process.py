@@ -1,15 +1,19 @@
-"""Starts the rig as a process of its own, for tests of other rooms too."""
+"""Starts the rig as a process of its own, or on the test's own loop, for tests of other rooms too."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
+
+from graderd.simulator.control_client import RigControl
+from graderd.simulator.process import Rig
 
 START_TIMEOUT_S = 40.0
 
@@ -36,3 +40,20 @@ def running_rig(directory: Path, *arguments: str) -> Iterator[tuple[subprocess.P
     finally:
         process.kill()
         process.wait()
+
+
+@contextlib.asynccontextmanager
+async def rig_here(directory: Path) -> AsyncIterator[tuple[Rig, RigControl]]:
+    """A rig on this test's own loop, and a client."""
+    rig = Rig(directory, seed=1)
+    running = asyncio.create_task(rig.run(), name="rig-under-test")
+    async with asyncio.timeout(START_TIMEOUT_S):
+        while not rig.paths.ready.exists():
+            assert not running.done(), running.exception()
+            await asyncio.sleep(0.02)
+    control = RigControl(rig.paths.control)
+    yield rig, control
+    await control.close()
+    rig.stop()
+    async with asyncio.timeout(START_TIMEOUT_S):
+        await running

@@ -9,9 +9,10 @@ import pytest
 from graderd.hal.clock import Clock, ManualClock, SystemClock
 from graderd.hal.errors import DeviceRefusedError
 from harness.awake_clock import AwakeClock
-from harness.fakes import FakeActuator, FakeRotator
+from harness.fakes import FakeActuator, FakeAxis, FakeRotator
 from tests.contract.conformance import (
     ActuatorStand,
+    AxisStand,
     ClockConformance,
     LinearActuatorConformance,
     RotatorConformance,
@@ -19,73 +20,62 @@ from tests.contract.conformance import (
 )
 
 
-class FakeRotatorStand(RotatorStand):
-    """A fake with no more than a speed, on a clock that moves when told."""
+class _FakeStand(AxisStand):
+    """What a stand has to know of a fake, on a clock that moves when told."""
 
-    low, high, reached, still = -FakeRotator.LIMIT, FakeRotator.LIMIT, 0.5, 0.01
+    low, high, reached, still = -FakeAxis.LIMIT, FakeAxis.LIMIT, 0.5, 0.01
     instant = True
 
-    def __init__(self) -> None:
+    def __init__(self, name: str, kind: type[FakeAxis]) -> None:
         self.clock: ManualClock = ManualClock(1000.0)
-        self.fake = FakeRotator("rotation", self.clock, -100.0, [])
+        self.fake = kind(name, self.clock, -100.0, [])
+
+    def true_position(self) -> float:
+        return self.fake.position
+
+    def mute(self) -> None:
+        self.fake.refuse_arm = DeviceRefusedError(self.fake.name, "cannot be told anything")
+
+    def unmute(self) -> None:
+        self.fake.refuse_arm = None
+
+    async def lose_wire(self) -> None:
+        self.fake.lose()
+
+    async def restore_wire(self) -> None:
+        self.fake.restore()
+
+    async def wait(self, seconds: float) -> None:
+        self.clock.advance(seconds)
+        if isinstance(self.fake, FakeRotator):
+            self.fake.turn()
+        await asyncio.sleep(0)
+
+
+class FakeRotatorStand(_FakeStand, RotatorStand):
+    """A fake with no more than a speed."""
+
+    fake: FakeRotator
+
+    def __init__(self) -> None:
+        super().__init__("rotation", FakeRotator)
 
     @property
     def device(self) -> FakeRotator:
         return self.fake
 
-    def true_position(self) -> float:
-        return self.fake.position
 
-    def mute(self) -> None:
-        self.fake.refuse_arm = DeviceRefusedError(self.fake.name, "cannot be told anything")
-
-    def unmute(self) -> None:
-        self.fake.refuse_arm = None
-
-    async def lose_wire(self) -> None:
-        self.fake.lose()
-
-    async def restore_wire(self) -> None:
-        self.fake.restore()
-
-    async def wait(self, seconds: float) -> None:
-        self.clock.advance(seconds)
-        self.fake.turn()
-        await asyncio.sleep(0)
-
-
-class FakeActuatorStand(ActuatorStand):
+class FakeActuatorStand(_FakeStand, ActuatorStand):
     """The same for an actuator."""
 
-    low, high, reached, still = -FakeActuator.LIMIT, FakeActuator.LIMIT, 0.5, 0.01
-    instant = True
+    fake: FakeActuator
 
     def __init__(self) -> None:
-        self.clock: ManualClock = ManualClock(1000.0)
-        self.fake = FakeActuator("tilt", self.clock, -100.0, [])
+        super().__init__("tilt", FakeActuator)
 
     @property
     def device(self) -> FakeActuator:
         return self.fake
-
-    def true_position(self) -> float:
-        return self.fake.position
-
-    def mute(self) -> None:
-        self.fake.refuse_arm = DeviceRefusedError(self.fake.name, "cannot be told anything")
-
-    def unmute(self) -> None:
-        self.fake.refuse_arm = None
-
-    async def lose_wire(self) -> None:
-        self.fake.lose()
-
-    async def restore_wire(self) -> None:
-        self.fake.restore()
-
-    async def wait(self, seconds: float) -> None:
-        self.clock.advance(seconds)
-        await asyncio.sleep(0)
 
 
 class TestFakeRotator(RotatorConformance):

@@ -24,6 +24,7 @@ from graderd.hal.errors import (
 from graderd.hal.settings import CameraSettings
 from graderd.simulator.control_client import RigControl
 from graderd.simulator.process import Rig
+from tests.rig_process import rig_here
 
 READY_S = 30.0
 
@@ -43,18 +44,8 @@ def settings_for(path: Path, **changes: Any) -> CameraSettings:
 
 @pytest.fixture
 async def rig(tmp_path: Path) -> AsyncIterator[tuple[Rig, RigControl]]:
-    machine = Rig(tmp_path / "rig", seed=1)
-    running = asyncio.create_task(machine.run(), name="rig-under-test")
-    async with asyncio.timeout(READY_S):
-        while not machine.paths.ready.exists():
-            assert not running.done(), running.exception()
-            await asyncio.sleep(0.02)
-    control = RigControl(machine.paths.control)
-    yield machine, control
-    await control.close()
-    machine.stop()
-    async with asyncio.timeout(READY_S):
-        await running
+    async with rig_here(tmp_path / "rig") as rig:
+        yield rig
 
 
 async def shot(camera: RigCamera, timeout_s: float = 5.0) -> Frame:

@@ -21,6 +21,7 @@ from graderd.runtime.app.sim import attach
 from graderd.simulator.control_client import RigControl
 from graderd.simulator.process import Rig
 from harness.electrak_sim import until
+from tests.rig_process import rig_here
 
 READY_S = 30.0
 CCVS = 0xFEF1
@@ -28,19 +29,8 @@ CCVS = 0xFEF1
 
 @pytest.fixture
 async def rig(tmp_path: Path) -> AsyncIterator[tuple[Rig, RigControl]]:
-    """A rig on this test's own loop, and a client."""
-    rig = Rig(tmp_path / "rig", seed=1)
-    running = asyncio.create_task(rig.run(), name="rig-under-test")
-    async with asyncio.timeout(READY_S):
-        while not rig.paths.ready.exists():
-            assert not running.done(), running.exception()
-            await asyncio.sleep(0.02)
-    control = RigControl(rig.paths.control)
-    yield rig, control
-    await control.close()
-    rig.stop()
-    async with asyncio.timeout(READY_S):
-        await running
+    async with rig_here(tmp_path / "rig") as rig:
+        yield rig
 
 
 def ccvs(raw: int) -> bytes:
