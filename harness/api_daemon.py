@@ -7,6 +7,7 @@ import time
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -269,7 +270,7 @@ class FakeDaemon:
         return Status(
             time_s=now_s,
             wall_time="2026-11-22T12:00:00Z",
-            version="0.1.0",
+            version=version("graderd"),
             simulated=True,
             mode=self.state.mode,
             reason=self.state.reason,
