@@ -26,7 +26,7 @@ BESIDE := -n 2 --dist loadgroup
 # A third of the tests' time is waiting, for virtual devices that move in real time.
 WAITING := -n 4 --dist loadgroup
 
-.PHONY: help run test unit quick passes test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean mutants mutants-wide core-coverage
+.PHONY: help run test unit quick passes peers test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean mutants mutants-wide core-coverage
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
@@ -82,6 +82,13 @@ unit: $(STAMP) ## run the pure tests: no process, no socket, seconds
 
 quick: $(STAMP) ## run the tests of functions, contracts and wires that take no ten seconds each
 	@$(TESTS) $(BESIDE) -m "not whole_machine and not serial_only and not slow" $(PYTEST_ARGS) tests/unit tests/contract tests/wire
+
+peers: $(STAMP) ## lerobot on the virtual servo, in an environment of its own (downloads it once; needs Python 3.12)
+	@test -x var/peers/lerobot/bin/python || { \
+	python=$$(PYENV_VERSION=3.12 $(BIN)/uv python find --system --no-python-downloads 3.12) && $$python -m venv var/peers/lerobot \
+	&& var/peers/lerobot/bin/python -m pip install --quiet --no-deps lerobot==0.6.1 \
+	&& var/peers/lerobot/bin/python -m pip install --quiet deepdiff draccus dynamixel-sdk huggingface-hub numpy pyserial tqdm; }
+	@$(TESTS) $(PYTEST_ARGS) tests/wire/test_dynamixel_lerobot.py
 
 test-pythons: $(PYTHONS:%=test-python-%) ## both commands on each Python that README names, one after the other
 
