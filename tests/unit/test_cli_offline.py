@@ -149,13 +149,25 @@ def test_config_show_prints_a_file_that_is_valid_again(tmp_path: Path, capsys: C
 def test_hand_overs(monkeypatch: pytest.MonkeyPatch, arguments: list[str], module: str, handed: list[str]) -> None:
     became: list[list[str]] = []
     monkeypatch.setattr("graderd.cli.console.os.execv", lambda _, argv: became.append(argv))
-    monkeypatch.setattr("graderd.cli.console.find_spec", lambda _: object())
     assert run_app(arguments) == 0
     assert became == [[sys.executable, "-P", "-m", module, *handed]]
 
 
-def test_a_program_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    monkeypatch.setattr("graderd.cli.console.find_spec", lambda _: None)
+def test_no_driver_is_imported_to_start_its_program() -> None:
+    """The contract of the command line holds at run time too."""
+    code = (
+        "import os, sys; os.execv = print; from graderd.cli.app import run_app; "
+        "run_app(['can', 'dump', '--', '--help']); "
+        "print([name for name in sys.modules if name.startswith(('graderd.drivers.', 'graderd.runtime'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_a_program_that_is_not_installed_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: Capture, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("graderd.cli.console._PACKAGE", tmp_path)
     assert run_app(["rig"]) == 1
     assert "does not contain it" in capsys.readouterr().err
 
