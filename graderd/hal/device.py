@@ -11,7 +11,7 @@ from graderd.hal.settings import Settings
 
 
 class Lifecycle(StrEnum):
-    """The four states every device goes through, ``closed -> standby -> active``, and ``failed`` from any of them.
+    """``closed -> standby -> active``, and ``failed`` from any of them.
 
     * CLOSED: the wire is not open.
     * STANDBY: open, identified and readable; unpowered, or powered and forbidden to move.
