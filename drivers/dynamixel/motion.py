@@ -15,6 +15,9 @@ _STAMP_S = 0.02
 _HULL_S = 0.1
 """Between readings further apart the speed may have been anything: the older one vouches for nothing."""
 _STILL_DEG_PER_S = 0.6
+STANDS_DEG, PUSHES_DEG = 3.0, 2.0
+"""Of the blade: a set point so far ahead of one that stands is led back to so little: enough to push and to be told as
+not moving, too little to leap when it comes free. One that is followed runs ahead too, but of a blade in motion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,3 +73,17 @@ def rest_deg(
     if former_deg is not None:
         far = max(far, ahead * former_deg)
     return ahead * far
+
+
+def led_back_deg(motion: ServoMotion, goal_deg: float, share: float, *, was_led_back: bool) -> float | None:
+    """The goal of a servo that stands while its own set point runs away from it; None: it follows, or has come so far.
+
+    ``share``: degrees of the servo for one of the blade. ``was_led_back``: until it moves again.
+    """
+    lag = motion.setpoint_deg - motion.position_deg
+    away = goal_deg - motion.position_deg
+    if abs(motion.velocity_deg_per_s) >= _STILL_DEG_PER_S or abs(away) <= PUSHES_DEG * share:
+        return None
+    if not was_led_back and (abs(lag) <= STANDS_DEG * share or lag * away < 0.0):
+        return None
+    return motion.position_deg + math.copysign(PUSHES_DEG * share, away)

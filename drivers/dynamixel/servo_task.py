@@ -17,7 +17,7 @@ from graderd.drivers.dynamixel.calibration import Calibration
 from graderd.drivers.dynamixel.codec import StatusError
 from graderd.drivers.dynamixel.connection import ServoLink, condition_of
 from graderd.drivers.dynamixel.device import ATTEMPTS_N, Ph54Device
-from graderd.drivers.dynamixel.motion import ServoMotion, rest_deg
+from graderd.drivers.dynamixel.motion import ServoMotion, led_back_deg, rest_deg
 from graderd.drivers.dynamixel.observer import SUPPLY_FAULTS, ServoObserver
 from graderd.hal.clock import Clock
 from graderd.hal.device import Lifecycle
@@ -48,6 +48,7 @@ class CommandSlot:
         self._held_s = -math.inf
         self._holding = False
         self._hard_profile = False
+        self._led_back = False
         self._taken = False
 
     def goal(self, goal_deg: float, now_s: float) -> None:
@@ -58,11 +59,11 @@ class CommandSlot:
         """Hold with the next packet; nothing to do where the last thing sent was a hold."""
         if self.goal_deg is None and self._holding and not self.hold_wanted:
             return
-        self.goal_deg, self.hold_wanted = None, True
+        self.goal_deg, self.hold_wanted, self._led_back = None, True, False
 
     def forget(self, sent_counts: int | None = None) -> None:
         """No command in force; ``sent_counts``: the goal that is on the servo, where that is known."""
-        self.goal_deg, self.hold_wanted, self._holding = None, False, False
+        self.goal_deg, self.hold_wanted, self._holding, self._led_back = None, False, False, False
         self._sent_counts, self._held_deg = sent_counts, None
 
     def armed(self, armed: arming.Armed) -> None:
@@ -128,14 +129,28 @@ class CommandSlot:
             raise DeviceRefusedError(DEVICE, cause, "Its turns were lost: reboot it")
         return counts
 
-    async def send_goal(self, device: Ph54Device) -> int | None:
-        """The goal, where the servo has not got it yet. Returns the counts sent, None where nothing was to send."""
+    async def send_goal(self, device: Ph54Device, motion: ServoMotion | None) -> int | None:
+        """The goal, where the servo has not got it yet. Returns the counts sent, None where nothing was to send.
+
+        While the blade stands against something the servo's own set point runs on towards the goal, and its profile
+        would bring it back slowly: the goal is led back with the hold's.
+        """
         if self.goal_deg is None:
             return None
-        counts = self.calibration.counts(self.goal_deg)
+        cal = self.calibration
+        counts, back_deg = cal.counts(self.goal_deg), None
+        if motion is not None and not self.sent_hold_after(motion):
+            share, led = self._settings.gear_ratio, self._led_back
+            back_deg = led_back_deg(motion, cal.servo_deg(counts), share, was_led_back=led)
+        self._led_back = back_deg is not None
+        if back_deg is not None:
+            low, high = cal.servo_limits()
+            counts = max(low, min(high, cal.servo_counts(back_deg)))
         former, self._held_deg = self._sent_counts, None
-        if self._hard_profile:
-            profile = arming.profile_counts(self._settings, self.calibration)
+        if self._hard_profile is not self._led_back:
+            profile = arming.profile_counts(self._settings, cal)
+            if self._led_back:
+                profile["profile_acceleration"] = self.hold_acceleration_counts
             self._sent_counts = counts
             await device.write_block(device.profile_block, {**profile, "goal_position": counts}, attempts_n=1)
         elif counts != former or not self._taken or self._holding:
@@ -143,7 +158,7 @@ class CommandSlot:
             await device.write("goal_position", counts, attempts_n=1)
         else:
             return None
-        self._hard_profile, self._holding, self._taken = False, False, True
+        self._hard_profile, self._holding, self._taken = self._led_back, False, True
         return counts
 
 
@@ -530,7 +545,7 @@ class ServoTask:
             if command.hold_wanted:
                 await self._hold(device)
             elif self.lifecycle is Lifecycle.ACTIVE:
-                sent = await command.send_goal(device)
+                sent = await command.send_goal(device, observer.motion)
         except DeviceRefusedError as e:
             await self._on_refusal(device, e)
         if sent is not None:

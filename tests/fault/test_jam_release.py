@@ -16,8 +16,9 @@ from graderd.runtime.state_file import StateFile
 from harness.fakes import FakeActuator, FakeEyes, FakeLink
 from tests.dynamixel_sim import bench, until
 
-JAM_S = 2.0
-"""Longer than the servo's own profile takes to follow a goal that comes back (0.4 s of braking, then the way)."""
+JAM_S = 0.65
+"""When the servo's own set point would be furthest ahead, were it not led back. Every other time:
+tests/unit/test_dynamixel_following.py."""
 NOT_MOVING_S = 5.0
 """So that the turn is not ended as jammed meanwhile: then there would be nothing to see."""
 LOOK_S = 0.002
