@@ -44,35 +44,35 @@ MAX_REPLY_LENGTH: Final = 96
 
 
 class WireAccess:
-    """One at a time; the others wait in order, urgent ones ahead of them. ``taken``: whether it is somebody's turn."""
+    """One at a time; the others wait in order, urgent ones ahead of them. ``taken``: whether somebody has it."""
 
     def __init__(self) -> None:
         self.taken = False
         self._queue: deque[asyncio.Future[None]] = deque()
 
     async def take(self, urgent: bool) -> None:
-        """Wait for the turn; every turn taken is given back with :meth:`give_back`."""
+        """Wait for the wire; it is given back with :meth:`give_back`."""
         if not self.taken:
             self.taken = True
             return
-        turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        granted: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         if urgent:
-            self._queue.appendleft(turn)
+            self._queue.appendleft(granted)
         else:
-            self._queue.append(turn)
+            self._queue.append(granted)
         try:
-            await turn
+            await granted
         except asyncio.CancelledError:
-            if turn.done() and not turn.cancelled():
+            if granted.done() and not granted.cancelled():
                 self.give_back()
             raise
 
     def give_back(self) -> None:
-        """End a turn; the next one's begins at once."""
+        """It goes over to the next one at once."""
         while self._queue:
-            turn = self._queue.popleft()
-            if not turn.done():
-                turn.set_result(None)  # the line stays taken: it goes over to the next one
+            granted = self._queue.popleft()
+            if not granted.done():
+                granted.set_result(None)  # the line stays taken: it goes over to the next one
                 return
         self.taken = False
 

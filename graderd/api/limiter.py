@@ -1,7 +1,7 @@
 """Keeps a flood of requests away from the control tick, and stop ahead of any flood.
 
 The daemon has one event loop. What decides whether the tick is late is how much work all ready requests do within one
-turn of that loop. So few requests are in work at a time, they are paced, some wait, and the others are told 503 late
+pass of that loop. So few requests are in work at a time, they are paced, some wait, and the others are told 503 late
 enough that a client in a loop cannot spin. Stop requests take no part in that: they have their own pace.
 """
 
@@ -58,7 +58,7 @@ class Closing:
 
 COMMANDS_PATH = "/v1/commands"
 SERVICES_PREFIX = "/v1/services/"
-LOOK_AT_MOST = 4
+READ_AT_MOST = 4
 """A command that is so many times larger than allowed is looked at for a stop, and no further."""
 METHODS_WITH_BODY = ("POST", "PUT", "PATCH", "DELETE")
 
@@ -186,7 +186,7 @@ class Limiter:
                     more = message.get("more_body", False)
                     if commands and is_stop_command(body, complete=not more):
                         return _Body(bytes(body), more, True)
-                    if size_n > limit_n and (not commands or not more or size_n > LOOK_AT_MOST * limit_n):
+                    if size_n > limit_n and (not commands or not more or size_n > READ_AT_MOST * limit_n):
                         break
                     if not more:
                         return _Body(bytes(body), False, False)

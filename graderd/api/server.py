@@ -33,7 +33,7 @@ from graderd.hal.clock import Pace
 from graderd.hal.errors import DeviceError
 
 MAX_PATH_BYTES = 107
-LOOK_AFTER_FILE_S = 1.0
+SOCKET_CHECK_S = 1.0
 
 log = logging.getLogger(__name__)
 
@@ -254,7 +254,7 @@ async def _keep_socket_file(
     connected stays so."""
     ours = _identity(path)
     while True:
-        await asyncio.sleep(LOOK_AFTER_FILE_S)
+        await asyncio.sleep(SOCKET_CHECK_S)
         if ours is not None and _identity(path) == ours:
             continue
         try:

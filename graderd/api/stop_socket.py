@@ -22,7 +22,7 @@ from graderd.api.tcp_guard import TcpGuard
 STOP_SUFFIX = ".stop"
 """The client has it too, which may load nothing of the interface: a test holds them together."""
 QUEUE_N = 16
-"""Taken at once in one turn of the event loop; more wait in the kernel."""
+"""Taken at once in one pass of the event loop; more wait in the kernel."""
 OPEN_N = 64
 SAID_MOST_BYTES = 4096
 TIMEOUT_S = 5.0

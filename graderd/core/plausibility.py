@@ -230,7 +230,7 @@ class _AxisWatch:
             self._goal, self._goal_since_s = goal, now_s
             self._move_s = self._duration_s(abs(goal - s.position), abs(self._velocity))
             if abs(goal - s.position) > self._figures.near:
-                self._turn(s, goal)
+                self._set_direction(s, goal)
 
     def _duration_s(self, way: float, speed: float) -> float:
         """How long a move takes at the device's own speed, braking from a speed in the wrong direction first."""
@@ -287,12 +287,12 @@ class _AxisWatch:
             return
         if self._rest is not None and self._displaced(s, self._rest, self._figures.tolerance, "away from its goal"):
             self._rest = None
-        self._turn(s, goal)
+        self._set_direction(s, goal)
         self._away(s, error, too_fast)
         if not self._stuck(s, error):
             self._arriving(s, goal, error)
 
-    def _turn(self, s: AxisSample, goal: float) -> None:
+    def _set_direction(self, s: AxisSample, goal: float) -> None:
         """Where its goal lies; one on the other side of a moving axis is legal, and leaves it the time to brake."""
         direction = math.copysign(1.0, goal - s.position)
         if direction == self._direction:

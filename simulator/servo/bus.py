@@ -26,7 +26,7 @@ _SPIN_S = 0.001
 """With wire time, the last part of a wait is spun: a sleeping process wakes too late by up to that much."""
 _RETURN_DELAY_STEP_S = 2e-6
 _STALL_S = 0.03
-"""A turn of the loop that comes so late is our own stall, not the client's silence: no watchdog counts it."""
+"""A pass of the loop that comes so late is our own stall, not the client's silence: no watchdog counts it."""
 
 
 class VirtualServoBus:

@@ -236,7 +236,7 @@ def free_port() -> int:
 
 
 async def test_a_socket_file_that_is_taken_away_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "LOOK_AFTER_FILE_S", 0.02)
+    monkeypatch.setattr(server, "SOCKET_CHECK_S", 0.02)
     async with serving(tmp_path) as (daemon, path), connect(path, "/v1/jog") as socket:
         for file in (path, stop_socket_beside(path)):
             rights = file.stat().st_mode

@@ -43,7 +43,7 @@ class Bench:
                 self.machine.eyes.next = SoilObservation(now_s, zone, 0.9, "", **shares)
             self.loop.run_tick()
             for _ in range(4):
-                await asyncio.sleep(0)  # the power keeper's task takes its turns
+                await asyncio.sleep(0)  # the power sequencer's task goes on
 
     async def do(self, command: cmd.Command) -> cmd.Reply:
         """Send a command and tick until it is answered."""
