@@ -108,6 +108,7 @@ def machine_answers() -> Iterator[tuple[str, Any]]:
         "renewed later": (jogging, (cmd.Renew(client="a"),), {"now_s": NOW_S + 0.25}),
         "armed already": (STATES["manual"], (cmd.Arm(),), {}),
         "several unmet": (STATES["disarmed"], (cmd.Arm(),), {"devices_active": False, "unmet": two}),
+        "several unmet for auto": (STATES["manual"], (cmd.Auto(),), {"unmet_for_auto": two}),
         "stage by stage": (replace(jogging, later=stages), (), {"settled": True}),
         "first picture": (STATES["auto"], (), {"observation": seen}),
         "next stage": (replace(jogging, later=(Goals(tilt_mm=5.0),)), (), {"settled": True}),

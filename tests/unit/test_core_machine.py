@@ -63,6 +63,9 @@ EVENTS: dict[str, Inputs] = {
     "stop": inputs(cmd.Stop(client="b"), devices_active=True),
     "reset": inputs(cmd.Reset(client="a", stop_n=0), devices_active=True),
     "auto": inputs(cmd.Auto(client="a"), devices_active=True),
+    "auto, not ready": inputs(
+        cmd.Auto(client="a"), devices_active=True, unmet_for_auto=(Unmet("method", "new", "show"),)
+    ),
     "manual": inputs(cmd.Manual(client="a"), devices_active=True),
     "jog": inputs(J, devices_active=True),
     "jog too far": inputs(cmd.Jog(axis="rotate", value=61.0, client="a"), devices_active=True),
@@ -89,6 +92,7 @@ TABLE: dict[str, tuple[str, str, str, str, str, str]] = {
     "stop": (S, S, S, S, S, S),
     "reset": (D, M, M, J_, A, D),
     "auto": (D, M, A, A, A, S),
+    "auto, not ready": (D, M, M, J_, A, S),
     "manual": (D, M, M, M, M, S),
     "jog": (D, M, J_, J_, A, S),
     "jog too far": (D, M, M, J_, A, S),
