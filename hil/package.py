@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -115,14 +116,27 @@ def newer_version(package: Path, directory: Path) -> Path:
     control = tree / "DEBIAN" / "control"
     lines = [f"Version: {NEWER}" if line.startswith("Version:") else line for line in control.read_text().splitlines()]
     control.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    config = tree / "opt" / "graderd" / "lib" / "common" / "graderd" / "config"
-    substitute(config / "models.py", "version: Literal[2] = 2", "version: Literal[3] = 3")
-    step = "2: lambda document: rename(document, 'yard.zero_deg', 'rotation.zero_deg')"
-    substitute(config / "migrate.py", "Mapping[int, Step]] = {1: _to_2}", f"Mapping[int, Step]] = {{1: _to_2, {step}}}")
+    newer_format(tree / "opt" / "graderd" / "lib" / "common" / "graderd" / "config")
     (tree / "DEBIAN" / "md5sums").unlink()  # dpkg makes its own where a package has none
     result = tree.with_suffix(".deb")
     subprocess.run(["dpkg-deb", "--root-owner-group", "-Zzstd", "-z1", "--build", tree, result], check=True, stdout=-3)
     return result
+
+
+def newer_format(config: Path) -> None:
+    """Let the package ``graderd.config`` know one format more, in which ``yard.zero_deg`` is ``rotation.zero_deg``.
+
+    Raises:
+        SystemExit: it does not look as expected (any more).
+    """
+    found = re.findall(r"version: Literal\[(\d+)\]", (config / "models.py").read_text(encoding="utf-8"))
+    now_n = int(found[0]) if found else 0
+    substitute(
+        config / "models.py", f"version: Literal[{now_n}] = {now_n}", "version: Literal[{0}] = {0}".format(now_n + 1)
+    )
+    steps = "STEPS: Final[Mapping[int, Step]] = {"
+    step = f"{now_n}: lambda document: rename(document, 'yard.zero_deg', 'rotation.zero_deg'), "
+    substitute(config / "migrate.py", steps, steps + step)
 
 
 def substitute(source: Path, old: str, new: str) -> None:

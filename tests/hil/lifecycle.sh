@@ -94,15 +94,16 @@ until_mode disarmed 10
 sed -i 's|nowhere|elsewhere|' /etc/graderd/graderd.toml
 
 step "an upgrade when disarmed keeps configuration and calibration, migrates an old file with a backup, restarts"
-# The newer package's format is 3: what stood in [yard] it wants in [rotation].
+# The newer package's format is one later: what stood in [yard] it wants in [rotation].
 printf '# the grader of the yard\n[yard]\nzero_deg = 7.25\n' >>/etc/graderd/graderd.toml
 echo keep >/var/lib/graderd/recordings/pass-1
+format=$(sed -n 's/^version = //p' /etc/graderd/graderd.toml)
 cp /etc/graderd/graderd.toml /tmp/before.toml
 install "$newer" >/tmp/upgrade 2>&1 || fail "upgrade: $(tail -5 /tmp/upgrade)"
 until_mode disarmed 60
 [ "$(dpkg-query -W -f '${Version}' graderd)" = 99.0.0 ] || fail "version"
 grep -q '^zero_deg = 7.25' /etc/graderd/graderd.toml || fail "calibration lost"
-grep -q '^version = 3' /etc/graderd/graderd.toml || fail "not migrated: $(cat /tmp/upgrade)"
+grep -q "^version = $((format + 1))" /etc/graderd/graderd.toml || fail "not migrated: $(cat /tmp/upgrade)"
 grep -q '^# the grader of the yard' /etc/graderd/graderd.toml || fail "comments lost"
 ! grep -q '^\[yard\]' /etc/graderd/graderd.toml || fail "what was moved still stands"
 cmp -s /tmp/before.toml /etc/graderd/graderd.toml.*.bak || fail "no backup of the former file"

@@ -37,6 +37,7 @@ former_configuration() {
 step "installed: $(version), $($python --version)"
 whole "$own"
 [ "$what" = all ] || exit 0
+own_format=$(format)
 
 step "configuration: root's to write, the group's to read"
 [ "$(stat -c '%U:%G %a' /etc/graderd)" = "root:graderd 750" ] || fail "rights of /etc/graderd: $(stat -c '%U:%G %a' /etc/graderd)"
@@ -85,16 +86,16 @@ if setpriv --reuid=planter --regid=graderd --clear-groups touch /etc/graderd/nam
 userdel planter
 
 step "upgraded: migrated with a backup; the byte code is the new files'"
-[ "$(format)" = 2 ] || fail "stale byte code: format $(format)"
-grep -q '^version = 2' $config || fail "not migrated: $(cat /tmp/said)"
+[ "$(format)" = $((own_format + 1)) ] || fail "stale byte code: format $(format)"
+grep -q "^version = $((own_format + 1))" $config || fail "not migrated: $(cat /tmp/said)"
 backup=$(echo /etc/graderd/graderd.toml.*.bak)
 cmp "$backup" /tmp/former.toml || fail "the backup is not the former file"
 
 step "downgrade: whole, not started with a configuration it cannot use, the backup named"
 install "$package" || fail "half-configured for a newer configuration: $(tail -5 /tmp/said)"
 whole "$own"
-[ "$(format)" = 1 ] || fail "stale byte code: format $(format)"
-grep -q '^version = 2' $config || fail "the newer configuration was changed"
+[ "$(format)" = "$own_format" ] || fail "stale byte code: format $(format)"
+grep -q "^version = $((own_format + 1))" $config || fail "the newer configuration was changed"
 grep -q "cp $backup $config" /tmp/said || fail "the backup is not named: $(cat /tmp/said)"
 cp "$backup" $config
 graderd config check $config >/dev/null || fail "the named backup cannot be used"

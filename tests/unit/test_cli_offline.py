@@ -153,6 +153,7 @@ def test_hand_overs(monkeypatch: pytest.MonkeyPatch, arguments: list[str], modul
     assert became == [[sys.executable, "-P", "-m", module, *handed]]
 
 
+@pytest.mark.live
 def test_no_driver_is_imported_to_start_its_program() -> None:
     """The contract of the command line holds at run time too."""
     code = (

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
 import pytest
+
+from graderd.config.migrate import CURRENT_VERSION
+from hil.package import newer_format
 
 PROJECT = Path(__file__).resolve().parents[2]
 BYTECODE = PROJECT / "packaging" / "bytecode"
@@ -143,3 +147,29 @@ def test_the_newest_backup_that_this_version_can_use_is_named(
     assert asked.count('"/etc/graderd/graderd.toml"') == 1
     exec(asked.replace('"/etc/graderd/graderd.toml"', repr(str(tmp_path / "graderd.toml"))), {})
     assert capsys.readouterr().out == f"{tmp_path}/graderd.toml.20260102-000000-10.bak\n"
+
+
+@pytest.mark.live
+def test_the_newer_package_of_the_hil_takes_this_ones_configuration(tmp_path: Path) -> None:
+    """`make hil-package` upgrades to a version with a later format; what it changes for that must still be there."""
+    shutil.copytree(PROJECT / "graderd" / "config", tmp_path / "graderd" / "config")
+    newer_format(tmp_path / "graderd" / "config")
+    config = tmp_path / "graderd.toml"
+    config.write_text(f"version = {CURRENT_VERSION}\n[yard]\nzero_deg = 7.25\n", encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-c", NEWER_MIGRATES, tmp_path / "graderd" / "config", config], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"version = {CURRENT_VERSION + 1}\n" in config.read_text(encoding="utf-8")
+    assert "[rotation]\nzero_deg = 7.25\n" in config.read_text(encoding="utf-8")
+
+
+NEWER_MIGRATES = """
+import sys
+from pathlib import Path
+import graderd
+sys.modules.pop("graderd.config", None)
+graderd.__path__.insert(0, str(Path(sys.argv[1]).parent))
+from graderd.config.migrate import migrate_file
+migrate_file(Path(sys.argv[2]))
+"""
