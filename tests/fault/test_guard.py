@@ -31,8 +31,10 @@ ADDRESSES = {"lift_left": 19, "lift_right": 20, "tilt": 27}
 FAR = {"lift_left": 290.0, "lift_right": 290.0, "tilt": 95.0}
 STILL_S = 0.5
 """From the guard's word on a wire to standstill there: a blade without torque runs out, an actuator brakes."""
-ENDS_S = 10.0
+ENDS_S = 15.0
 """The guard's process on an idle machine needs a second, most of it to start; here it shares what there is."""
+SLOW_PERCENT = 20.0
+"""No axis is at its end before 17 s: what ends its motion before that is the guard."""
 GUARD_TOML = """\
 [rotation]
 port = "{servo}"
@@ -145,8 +147,7 @@ async def _set_off(servo: VirtualServo, units: dict[str, VirtualElectrak], can_w
 
 def _send(can_wire: VirtualActuatorBus, name: str, address: int, *, enable: bool) -> None:
     codec = ElectrakCodec("electrak_md" if name == "tilt" else "electrak_hd")
-    speed_percent = 20.0 if name == "tilt" else 50.0
-    data = codec.encode_control(Control(FAR[name], 5.0, speed_percent, motion_enable=enable))
+    data = codec.encode_control(Control(FAR[name], 5.0, SLOW_PERCENT, motion_enable=enable))
     can_wire.send(Frame(make_id(3, Pgn.PROPRIETARY_A, 0xE7, address), data))
 
 
