@@ -28,6 +28,8 @@ FLAT_GRAY = 1.6
 """Standard deviation (grey levels) within a tile of the smoothed sample below which it shows nothing."""
 STILL_FLAT_PERCENT = 99.0
 CLIPPED_GRAY = 250
+LAYER_MOST_M = 0.10
+"""A layer of soil before a lifted blade is hardly thicker: it would fill the quarter-scale blade to 40 %."""
 BLUR_ROWS_N = 9
 BLUR_MIN_CONTRAST = 64.0
 """Square grey levels of four summed pixels."""
@@ -174,7 +176,9 @@ class HealthMonitor:
         offset_m = float(ground.height_at(np.zeros(1), np.zeros(1))[0])
         level = abs(offset_m) < settings.knocked_ground_mm / 1000 and ground.slope_deg() < settings.knocked_ground_deg
         if soil.edge is None:
-            if abs(offset_m) > settings.knocked_ground_mm / 1000:
+            # A level layer of soil looks like ground that is higher; see LAYER_MOST_M for how thick one may be.
+            layer = 0.0 < offset_m < LAYER_MOST_M and ground.slope_deg() < settings.knocked_ground_deg
+            if abs(offset_m) > settings.knocked_ground_mm / 1000 and not layer:
                 moved.append(f"ground {offset_m * 1000:+.0f} mm off")
         else:
             up_m = soil.edge.height_m - stance.edge_m(self._blade) - stance.tall_m(self._blade)

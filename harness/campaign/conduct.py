@@ -113,7 +113,7 @@ async def enter(stack: Stack, phase: Phase) -> None:
     watch = stack.watch
     if phase is Phase.TURNING:
         angle_deg = watch.newest().state["blade_deg"]
-        await stack.ask_rig("scene", zone="right" if angle_deg > 8.0 else "even", seed=3)
+        await stack.ask_rig("scene", zone="right" if angle_deg > 0.0 else "left", seed=3)
         answer = await stack.command("auto")
         if not answer["accepted"]:
             raise CampaignError(f"automatic operation was refused: {answer.get('message') or answer.get('error')}")

@@ -95,6 +95,20 @@ def test_a_blade_that_its_lifts_raised_is_no_fault(height_mm: float) -> None:
     assert observation.zone is Zone.LEFT
 
 
+@pytest.mark.parametrize("layer_m", [0.025, 0.045])
+def test_a_layer_before_a_blade_whose_edge_is_lifted_out_of_sight_is_unknown_and_no_fault(layer_m: float) -> None:
+    scene = Scene(
+        angle_deg=15.0,
+        seed=3,
+        blade=BladeGeometry(bottom_z_m=0.12),
+        ground=lambda x, y: np.where(np.abs(y) < 0.7, layer_m, 0.0) + 0.0 * x,
+    )
+    observation = judged(scene, MeasuredAttitude(120.0, 0.0, 0.0))
+    assert observation.faults == ()
+    assert observation.zone is Zone.UNKNOWN
+    assert "lower the blade" in observation.reason
+
+
 def test_the_surface_is_found_to_the_millimetre() -> None:
     rng = np.random.default_rng(1)
     x, y = (rng.uniform(*span, 20_000).astype(np.float32) for span in ((-1.0, 0.8), (-1.0, 1.0)))
