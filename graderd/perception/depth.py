@@ -224,8 +224,8 @@ class DepthJudge:
         raised_m = float(soil.ground.height_at(np.zeros(1), np.zeros(1))[0])
         if soil.edge is None and raised_m > SUNK_M:
             return verdict.unknown(
-                f"what looks like ground is {raised_m * 1000:.0f} mm higher than calibrated, and the blade's upper edge, "
-                "which tells a level layer of soil from ground, is not in sight: lower the blade"
+                f"what looks like ground is {raised_m * 1000:.0f} mm higher than calibrated, and the blade's upper "
+                "edge, which tells a level layer of soil from ground, is not in sight: lower the blade"
             )
         things_l = sum(soil.things_l)
         most_l = settings.form.thing_largest_l if soil.form_is_sure else settings.none_volume_l
