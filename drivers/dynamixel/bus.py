@@ -148,6 +148,10 @@ class ServoRefusedError(DeviceRefusedError):
         self.error = error
 
 
+class NotCarriedOutError(DeviceTimeoutError):
+    """Nothing of it was done: each attempt arrived damaged, by the servo's word, or was not made."""
+
+
 class ServoBus:
     """One serial port with Protocol 2.0 servos on it.
 
@@ -360,6 +364,7 @@ class ServoBus:
         self, servo_id: int, packet: bytes, reply_data_n: int | None, attempts_n: int, urgent: bool
     ) -> Packet:
         access = self._access
+        in_doubt = False  # whether the servo may have carried it out
         for attempt in range(attempts_n):
             if access.taken:
                 await access.take(urgent)
@@ -369,6 +374,7 @@ class ServoBus:
                 if attempt:
                     self._counters["retries_n"] += 1
                 if self._owed and urgent:
+                    in_doubt = True
                     await self._transmit(packet)  # a stop does not wait until the line is known to be clear
                     self._owe(reply_data_n)
                 if self._owed and not await self._fence(servo_id):
@@ -377,6 +383,7 @@ class ServoBus:
             finally:
                 access.give_back()
             if reply is None:
+                in_doubt = True
                 continue
             error = reply.error
             if not error:
@@ -386,7 +393,7 @@ class ServoBus:
                 continue
             self._counters["refused_n"] += 1
             raise ServoRefusedError(self._where(servo_id), _describe(packet), error)
-        raise DeviceTimeoutError(
+        raise (DeviceTimeoutError if in_doubt else NotCarriedOutError)(
             self._where(servo_id),
             f"no valid status packet to {_describe(packet)} in {attempts_n} attempt(s)",
             "Check power, cable, id and baud rate",

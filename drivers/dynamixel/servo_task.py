@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Final
 
 from graderd.drivers.dynamixel import arming
-from graderd.drivers.dynamixel.bus import ServoRefusedError
+from graderd.drivers.dynamixel.bus import NotCarriedOutError, ServoRefusedError
 from graderd.drivers.dynamixel.calibration import Calibration
 from graderd.drivers.dynamixel.codec import StatusError
 from graderd.drivers.dynamixel.connection import ServoLink, condition_of
@@ -106,6 +106,9 @@ class CommandSlot:
             values = {**profile, "profile_acceleration": hard, "goal_position": counts}
             self._hard_profile = True
             await device.write_block(device.profile_block, values, attempts_n=attempts_n, urgent=True)
+        except NotCarriedOutError:
+            self._held_deg = None  # it turns on, and the next hold is another
+            raise
         except ServoRefusedError as e:
             self._held_deg, self._hard_profile = None, False
             if e.error == StatusError.DATA_RANGE:  # its watchdog has tripped: it brakes by itself
@@ -180,6 +183,9 @@ _STILL_READS_N = 5
 _UNANSWERED_N = 7
 """A lost servo left so many requests in a row unanswered. Where one exchange in seven is lost that happens once in
 700,000; a program that stood still asked none."""
+_IN_DOUBT_N = 4
+"""A hold that went unanswered was taken or not: only a reading tells, and it is asked for so often. What is sent
+without one turns the blade back where the hold was not taken, or on where it was."""
 _OLD_S = 0.15
 """A hold reads the angle again where the last reading is older; a younger one tells well enough where the blade is."""
 
@@ -558,9 +564,10 @@ class ServoTask:
             command.forget()  # nothing is powered: nothing to hold
             return
         too_old = self._clock.now_s() - observer.motion.time_s > _OLD_S
-        if too_old or command.sent_hold_after(observer.motion):
+        in_doubt = command.sent_hold_after(observer.motion)
+        if too_old or in_doubt:
             with contextlib.suppress(DeviceTimeoutError):
-                await observer.read_telemetry(device, None)
+                await observer.read_telemetry(device, None, attempts_n=_IN_DOUBT_N if in_doubt else 1)
         observer.note_sent(await command.send_hold(device, observer.motion, self._clock.now_s()))
 
     async def _on_refusal(self, device: Ph54Device, error: DeviceRefusedError) -> None:

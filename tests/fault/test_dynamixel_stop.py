@@ -116,6 +116,33 @@ async def test_with_15_percent_of_the_exchanges_lost(rig: Bench) -> None:
     assert not rig.conditions() & {"no_reply", "ram_reset", "torque_off", "wrong_device"}
 
 
+@pytest.mark.parametrize("lost_s", [0.02, 0.05, 0.08])
+async def test_a_hold_that_is_lost_with_what_is_asked_after_it(rig: Bench, lost_s: float) -> None:
+    """The servo turned on meanwhile: the hold that it takes at last is not the one it was to take at first."""
+    await under_way(rig)
+    rig.bus.inject("drop_requests")
+    asyncio.get_running_loop().call_later(lost_s, rig.bus.clear_faults)
+    assert good(await stopped(rig, f"nothing heard for {lost_s:g} s"), STANDSTILL_S + lost_s)
+
+
+async def test_a_hold_whose_answer_is_lost_with_those_after_it(rig: Bench) -> None:
+    """The servo took it and stands: what is sent again does not move it on."""
+    await under_way(rig)
+    from_deg = rig.servo.shaft_deg
+    rig.bus.inject("drop")
+    asyncio.get_running_loop().call_later(0.08, rig.bus.clear_faults)
+    assert good(await stopped(rig, "no answer for 0.08 s"))
+    assert rig.servo.shaft_deg - from_deg < 3.0
+
+
+async def test_holds_that_arrive_damaged_again_and_again(rig: Bench) -> None:
+    """Answered CRC Error each time: known not to have been taken, however often."""
+    await under_way(rig)
+    rig.bus.inject("damage_requests")
+    asyncio.get_running_loop().call_later(0.06, rig.bus.clear_faults)
+    assert good(await stopped(rig, "damaged for 0.06 s"), 0.5)
+
+
 @pytest.mark.parametrize("deg", [-15.0, 15.0, 40.0])
 async def test_one_wrong_position_with_a_right_crc(rig: Bench, deg: float) -> None:
     await under_way(rig)
