@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Coroutine
+from functools import update_wrapper
+from typing import Any
 
 import pytest
 
@@ -48,6 +51,23 @@ async def lifting(machine: Machine) -> None:
     assert machine.units["lift_left"].velocity_mm_per_s > 20.0
 
 
+def in_mid_lift(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
+    """Run a test in simulated time with the left lift in mid-move; it is handed loop and machine."""
+
+    async def main(loop: SimulatedLoop, arguments: dict[str, Any]) -> None:
+        async with Machine(loop, names=("lift_left",)) as machine:
+            await lifting(machine)
+            await test(loop, machine, **arguments)
+
+    def run(**arguments: Any) -> None:
+        run_simulated(lambda loop: main(loop, arguments))
+
+    update_wrapper(run, test)
+    signature = inspect.signature(test)  # pytest shall see what is parametrized, and nothing else
+    run.__signature__ = signature.replace(parameters=[*signature.parameters.values()][2:])  # type: ignore[attr-defined]
+    return run
+
+
 def out_claim_everything(machine: Machine) -> Callable[[], None]:
     """A node that takes every address that we claim; the call ends it."""
     ours = machine.link.node.claimer.name.to_bytes()
@@ -66,65 +86,59 @@ def out_claim_everything(machine: Machine) -> Callable[[], None]:
     return end
 
 
-def test_a_contention_in_mid_lift_stops_at_once_and_a_stop_during_the_new_claim_finds_it_stopped() -> None:
-    async def main(loop: SimulatedLoop) -> None:
-        async with Machine(loop, names=("lift_left",)) as machine:
-            await lifting(machine)
-            lost_s = loop.now_s()
-            machine.bus.send(claim(OURS))
-            await asyncio.sleep(0.005)
-            without: int | None = machine.link.address
-            assert without is None
-            machine.axes["lift_left"].hold()
-            first_s, first = commands(machine, lost_s)[0]
-            assert not enabled(first)
-            assert source_of(first.can_id) == OURS, "from the old address: there is no other"
-            assert first_s - lost_s <= 0.001
-            assert await standstill(machine, lost_s) <= 0.25
-            await asyncio.sleep(0.5)
-            assert machine.link.address == 128
-            assert not any(enabled(f) for _, f in commands(machine, lost_s))
-
-    run_simulated(main)
+@in_mid_lift
+async def test_a_contention_in_mid_lift_stops_at_once_and_a_stop_during_the_new_claim_finds_it_stopped(
+    loop: SimulatedLoop, machine: Machine
+) -> None:
+    lost_s = loop.now_s()
+    machine.bus.send(claim(OURS))
+    await asyncio.sleep(0.005)
+    without: int | None = machine.link.address
+    assert without is None
+    machine.axes["lift_left"].hold()
+    first_s, first = commands(machine, lost_s)[0]
+    assert not enabled(first)
+    assert source_of(first.can_id) == OURS, "from the old address: there is no other"
+    assert first_s - lost_s <= 0.001
+    assert await standstill(machine, lost_s) <= 0.25
+    await asyncio.sleep(0.5)
+    assert machine.link.address == 128
+    assert not any(enabled(f) for _, f in commands(machine, lost_s))
 
 
 @pytest.mark.parametrize("stop_after_s", [0.0, 0.1, 0.24, 1.0])
-def test_a_stop_gets_through_against_a_node_that_takes_every_address(stop_after_s: float) -> None:
-    async def main(loop: SimulatedLoop) -> None:
-        async with Machine(loop, names=("lift_left",)) as machine:
-            await lifting(machine)
-            lost_s = loop.now_s()
-            out_claim_everything(machine)
-            await machine.drive({"lift_left": 280.0}, stop_after_s)
-            stop_s = loop.now_s()
-            machine.axes["lift_left"].hold()
-            assert await standstill(machine, lost_s) <= max(0.25, stop_after_s + 0.001), "it stands when the stop comes"
-            await asyncio.sleep(1.0)
-            told = commands(machine, lost_s)
-            assert told
-            assert told[0][0] - lost_s <= 0.021
-            assert not any(enabled(f) for _, f in told)
-            assert machine.link.address is None
-            assert not [f for t, f in commands(machine, stop_s + 0.5)], "at rest: no word from somebody else's address"
-
-    run_simulated(main)
+@in_mid_lift
+async def test_a_stop_gets_through_against_a_node_that_takes_every_address(
+    loop: SimulatedLoop, machine: Machine, stop_after_s: float
+) -> None:
+    lost_s = loop.now_s()
+    out_claim_everything(machine)
+    await machine.drive({"lift_left": 280.0}, stop_after_s)
+    stop_s = loop.now_s()
+    machine.axes["lift_left"].hold()
+    assert await standstill(machine, lost_s) <= max(0.25, stop_after_s + 0.001), "it stands when the stop comes"
+    await asyncio.sleep(1.0)
+    told = commands(machine, lost_s)
+    assert told
+    assert told[0][0] - lost_s <= 0.021
+    assert not any(enabled(f) for _, f in told)
+    assert machine.link.address is None
+    assert not [f for t, f in commands(machine, stop_s + 0.5)], "at rest: no word from somebody else's address"
 
 
-def test_a_disable_that_was_lost_is_said_again_until_the_actuator_stands() -> None:
-    async def main(loop: SimulatedLoop) -> None:
-        async with Machine(loop, names=("lift_left",)) as machine:
-            await lifting(machine)
-            unit = machine.units["lift_left"]
-            hear, deaf_until_s = unit.on_frame, loop.now_s() + 0.15
-            unit.on_frame = (  # type: ignore[method-assign]
-                lambda frame, now_s: hear(frame, now_s) if now_s > deaf_until_s else None
-            )
-            lost_s = loop.now_s()
-            end = out_claim_everything(machine)
-            assert await standstill(machine, lost_s) <= 0.45
-            end()
-
-    run_simulated(main)
+@in_mid_lift
+async def test_a_disable_that_was_lost_is_said_again_until_the_actuator_stands(
+    loop: SimulatedLoop, machine: Machine
+) -> None:
+    unit = machine.units["lift_left"]
+    hear, deaf_until_s = unit.on_frame, loop.now_s() + 0.15
+    unit.on_frame = (  # type: ignore[method-assign]
+        lambda frame, now_s: hear(frame, now_s) if now_s > deaf_until_s else None
+    )
+    lost_s = loop.now_s()
+    end = out_claim_everything(machine)
+    assert await standstill(machine, lost_s) <= 0.45
+    end()
 
 
 def test_no_address_is_a_fault_within_three_tenths_of_a_second_and_arming_is_refused() -> None:
@@ -172,51 +186,47 @@ def test_a_claim_that_succeeded_is_followed_at_once_by_what_is_owed() -> None:
     run_simulated(main)
 
 
-def test_a_stop_while_the_bus_was_lost_goes_out_first_when_it_is_back() -> None:
-    async def main(loop: SimulatedLoop) -> None:
-        async with Machine(loop, names=("lift_left",)) as machine:
-            await lifting(machine)
-            machine.units["lift_left"].behaviour.speed_factor = 0.1  # slow, so that it is still on its way
-            machine.bus.interface_down()
-            await asyncio.sleep(0.05)
-            machine.axes["lift_left"].hold()
-            while not machine.link.is_open:
-                await asyncio.sleep(0.001)
-            back_s = loop.now_s()
-            await asyncio.sleep(0.005)
-            (first_s, first), *_ = commands(machine, back_s - 0.002)
-            assert first_s - back_s <= 0.002, "not after the 250 ms of the claim"
-            assert not enabled(first)
-            assert await standstill(machine, back_s) <= 0.25
-
-    run_simulated(main)
+@in_mid_lift
+async def test_a_stop_while_the_bus_was_lost_goes_out_first_when_it_is_back(
+    loop: SimulatedLoop, machine: Machine
+) -> None:
+    machine.units["lift_left"].behaviour.speed_factor = 0.1  # slow, so that it is still on its way
+    machine.bus.interface_down()
+    await asyncio.sleep(0.05)
+    machine.axes["lift_left"].hold()
+    while not machine.link.is_open:
+        await asyncio.sleep(0.001)
+    back_s = loop.now_s()
+    await asyncio.sleep(0.005)
+    (first_s, first), *_ = commands(machine, back_s - 0.002)
+    assert first_s - back_s <= 0.002, "not after the 250 ms of the claim"
+    assert not enabled(first)
+    assert await standstill(machine, back_s) <= 0.25
 
 
-def test_a_stop_during_bus_off_goes_out_as_soon_as_the_controller_is_back() -> None:
-    async def main(loop: SimulatedLoop) -> None:
-        async with Machine(loop, names=("lift_left",)) as machine:
-            await lifting(machine)
-            port = machine.link._port
-            assert port is not None
-            send, read = port.send, port.read
+@in_mid_lift
+async def test_a_stop_during_bus_off_goes_out_as_soon_as_the_controller_is_back(
+    loop: SimulatedLoop, machine: Machine
+) -> None:
+    port = machine.link._port
+    assert port is not None
+    send, read = port.send, port.read
 
-            def refuse(frame: Frame) -> None:
-                raise PortFullError(f"no buffer space for {frame.can_id:X}")
+    def refuse(frame: Frame) -> None:
+        raise PortFullError(f"no buffer space for {frame.can_id:X}")
 
-            port.send = refuse  # type: ignore[method-assign]
-            machine.bus.inject("bus_off")
-            await asyncio.sleep(0.03)
-            machine.axes["lift_left"].hold()
-            await asyncio.sleep(0.043)
-            assert "bus_off" in conditions(machine.link)
-            port.send = send  # type: ignore[method-assign]
-            back_s = loop.now_s()
-            machine.bus.report_state("error_active")
-            await asyncio.sleep(0.002)
-            (first_s, first), *_ = commands(machine, back_s)
-            assert first_s - back_s <= 0.001
-            assert not enabled(first)
-            assert await standstill(machine, back_s) <= 0.25
-            assert BusEvent.BUS_OFF not in read()
-
-    run_simulated(main)
+    port.send = refuse  # type: ignore[method-assign]
+    machine.bus.inject("bus_off")
+    await asyncio.sleep(0.03)
+    machine.axes["lift_left"].hold()
+    await asyncio.sleep(0.043)
+    assert "bus_off" in conditions(machine.link)
+    port.send = send  # type: ignore[method-assign]
+    back_s = loop.now_s()
+    machine.bus.report_state("error_active")
+    await asyncio.sleep(0.002)
+    (first_s, first), *_ = commands(machine, back_s)
+    assert first_s - back_s <= 0.001
+    assert not enabled(first)
+    assert await standstill(machine, back_s) <= 0.25
+    assert BusEvent.BUS_OFF not in read()
