@@ -203,6 +203,33 @@ async def test_power_lost_during_arming_leaves_no_torque(rig: Bench) -> None:
     await rig.rotator.disarm()
 
 
+@pytest.mark.parametrize("after_s", [0.0, 0.01, 0.03, 0.06, 0.09])
+@pytest.mark.parametrize("what", ["cancelled", "closed", "unplugged"])
+async def test_arming_that_is_broken_off_leaves_no_torque(rig: Bench, what: str, after_s: float) -> None:
+    """A stop cancels an arming at whatever point it is: nothing is powered, nothing moves, and it arms again."""
+    arming = asyncio.create_task(rig.rotator.arm())
+    await asyncio.sleep(after_s)
+    rig.rotator.hold()
+    match what:
+        case "cancelled":
+            arming.cancel()
+        case "closed":
+            await rig.rotator.close()
+        case "unplugged":
+            await rig.bus.unplug()
+    await asyncio.gather(arming, return_exceptions=True)
+    if what == "unplugged":
+        await rig.until(lambda: rig.rotator.lifecycle is Lifecycle.FAILED)
+        await rig.bus.replug()
+    if what == "closed":
+        await rig.rotator.open()
+    elif rig.rotator.lifecycle is Lifecycle.ACTIVE:  # it was armed already
+        await rig.rotator.disarm()
+    await rig.until(lambda: rig.rotator.lifecycle is Lifecycle.STANDBY and not rig.servo.torque_enabled)
+    assert rig.servo.shaft_deg == pytest.approx(0.0, abs=0.3)
+    await works_again(rig, 3.0)
+
+
 async def test_arming_is_refused_outside_the_limits_and_in_motion(rig: Bench) -> None:
     rig.servo.shaft_deg = 80.0
     await rig.rotator.wait_telemetry()
