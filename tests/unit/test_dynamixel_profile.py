@@ -123,6 +123,12 @@ def test_a_loaded_profile_is_a_copy() -> None:
     assert firmware_profiles.load("ph54_200_s500")["table"]["register"]
 
 
+def test_the_family_fits_its_schema() -> None:
+    schema = json.loads((files(firmware_profiles) / "servo_family.schema.json").read_text(encoding="utf-8"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.validate(firmware_profiles.load("p_series"), schema)
+
+
 # -- other servos of the family, from the SDK's tables ----------------------------------------------------------------
 
 
