@@ -26,7 +26,7 @@ BESIDE := -n 2 --dist loadgroup
 # A third of the tests' time is waiting, for virtual devices that move in real time.
 WAITING := -n 4 --dist loadgroup
 
-.PHONY: help run test unit quick passes peers test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean mutants mutants-wide core-coverage
+.PHONY: help run test unit quick passes peers test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean mutants mutants-wide claims core-coverage
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
@@ -149,6 +149,9 @@ mutants: $(STAMP) ## mutate gate, state machine and fault monitor; list what the
 
 mutants-wide: $(STAMP) ## seed thirty mistakes in runtime, drivers and interface; each must be noticed by its nearest tests
 	@$(BIN)/python -m harness.mutants_wide $(ARGS)
+
+claims: $(STAMP) ## take out what the safety concept claims, one by one; the tests it names must notice
+	@$(BIN)/python -m harness.claims $(ARGS)
 
 core-coverage: $(STAMP) ## branch coverage of gate, state machine and fault monitor by their own tests (must be 100 %)
 	@$(BIN)/python -m pytest -q -n 2 --cov=graderd.core.gate --cov=graderd.core.machine --cov=graderd.core.faults --cov-branch --cov-fail-under=100 --cov-report=term-missing tests/unit/test_core_gate.py tests/unit/test_core_machine.py tests/unit/test_core_machine_model.py tests/unit/test_core_golden.py tests/unit/test_fault_catalogue.py

@@ -119,10 +119,10 @@ class FakeDaemon:
     def config(self) -> dict[str, Any]:
         return {"machine": self.settings.model_dump(mode="json"), "rig": {"port": Path("/dev/null").name}}
 
-    async def preview_jpeg(self) -> bytes:
+    async def preview_jpeg(self) -> tuple[bytes, float]:
         if self.picture is None:
             raise ServiceError("no picture yet", "look at the camera's cable")
-        return self.picture
+        return self.picture, 0.25
 
     def bus_text(self, name: str) -> AsyncGenerator[str, None]:
         if name != "can":

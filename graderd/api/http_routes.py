@@ -45,6 +45,8 @@ NEEDS_CONSENT = """Wants `consent: true`, a disarmed machine, and no other such 
 NEEDS_UPGRADE = """ It moves the blade for as long as it runs, so it is a WebSocket of the same path: the first message
 is this body, every further one renews the lease, the last that comes is `{"result": ...}` or a `Problem`. It ends, and
 the blade holds, when the connection ends or is silent for half a second."""
+PICTURE_AGE = "Picture-Age-S"
+PICTURE_AGE_SCHEMA = {"description": "seconds since the picture was taken", "schema": {"type": "number"}}
 UPGRADE = "open it as a WebSocket, or use the client or 'graderd'"
 T = TypeVar("T")
 NAMES_N = 1000
@@ -124,14 +126,19 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: 
         tags=["status"],
         summary="The newest picture with the three zones drawn on it",
         response_class=Response,
-        responses={200: {"content": {"image/jpeg": {}}}, 404: {"model": Problem, "description": "no picture yet"}},
+        responses={
+            200: {"content": {"image/jpeg": {}}, "headers": {PICTURE_AGE: PICTURE_AGE_SCHEMA}},
+            404: {"model": Problem, "description": "no picture yet"},
+        },
     )
     async def preview() -> Response:
         try:
-            picture = await port.preview_jpeg()
+            picture, age_s = await port.preview_jpeg()
         except ServiceError as error:
             raise ProblemError(404, error.message, "preview", error.remedy) from error
-        return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+        return Response(
+            picture, media_type="image/jpeg", headers={"Cache-Control": "no-store", PICTURE_AGE: f"{age_s:.3f}"}
+        )
 
     for name, offered in port.services().items():
         _add_service(router, port, name, offered)

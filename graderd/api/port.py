@@ -42,8 +42,8 @@ class DaemonPort(Protocol):
         """The resolved configuration."""
         ...
 
-    async def preview_jpeg(self) -> bytes:
-        """The newest annotated picture.
+    async def preview_jpeg(self) -> tuple[bytes, float]:
+        """The newest annotated picture, and its age in seconds.
 
         Raises:
             ServiceError: there is none.

@@ -127,9 +127,10 @@ class CameraProblem(_Message):
 
 
 class Preview(_Message):
-    """An annotated picture, JPEG, base64."""
+    """An annotated picture, JPEG, base64; ``capture_s``: monotonic, when it was taken."""
 
     kind: Literal["preview"] = "preview"
+    capture_s: float
     jpeg_base64: str
 
 

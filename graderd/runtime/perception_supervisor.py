@@ -25,6 +25,7 @@ from graderd.hal.clock import Clock
 from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError
 from graderd.hal.fault import DeviceFault, PresentFaults
+from graderd.hal.reading import Reading
 from graderd.hal.settings import CameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
 from graderd.runtime.perception_protocol import (
@@ -94,7 +95,7 @@ class PerceptionSupervisor:
         self._opens_without_frame_n = 0
         self._restarts_n = 0
         self._frame_times: deque[float] = deque(maxlen=30)
-        self._preview: asyncio.Future[bytes] | None = None
+        self._preview: asyncio.Future[Reading[bytes]] | None = None
         self._saved: asyncio.Future[Saved] | None = None
 
     @property
@@ -165,8 +166,8 @@ class PerceptionSupervisor:
         """Tell the child the measured blade angle and attitude; dropped while the child does not read."""
         self._write(Angle(angle_deg=angle_deg, time_s=time_s, **asdict(attitude)))
 
-    async def preview_jpeg(self, timeout_s: float = 3.0) -> bytes:
-        """The next frame's annotated picture.
+    async def preview_jpeg(self, timeout_s: float = 3.0) -> Reading[bytes]:
+        """The next frame's annotated picture, and when it was taken.
 
         Raises:
             TimeoutError: none came.
@@ -304,7 +305,7 @@ class PerceptionSupervisor:
             if self._saved is not None and not self._saved.done():
                 self._saved.set_result(message)
         elif self._preview is not None and not self._preview.done():
-            self._preview.set_result(base64.b64decode(message.jpeg_base64))
+            self._preview.set_result(Reading(base64.b64decode(message.jpeg_base64), message.capture_s))
         return True
 
     async def _kill(self) -> None:

@@ -85,12 +85,13 @@ class Port:
         """The resolved configuration."""
         return self._config.model_dump(mode="json")
 
-    async def preview_jpeg(self) -> bytes:
-        """The newest annotated picture."""
+    async def preview_jpeg(self) -> tuple[bytes, float]:
+        """The newest annotated picture, and its age in seconds."""
         try:
-            return await self._eyes.preview_jpeg()
+            picture = await self._eyes.preview_jpeg()
         except TimeoutError:
             raise ServiceError("the camera gives no picture", "see graderd status for its fault") from None
+        return picture.value, picture.age_s(self._loop.tick.now_s)
 
     def bus_text(self, name: str) -> AsyncGenerator[str, None]:
         """What is on a wire from now on; a reader that is slow loses the oldest lines and is told how many."""

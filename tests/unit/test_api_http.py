@@ -160,6 +160,7 @@ async def test_config_preview_and_services(tmp_path: Path) -> None:
         assert (await client.get("/v1/config")).json()["machine"]["lease_s"] == 0.3
         picture = await client.get("/v1/preview.jpg")
         assert (picture.headers["content-type"], picture.content) == ("image/jpeg", JPEG)
+        assert picture.headers["picture-age-s"] == "0.250"
         daemon.picture = None
         assert (await client.get("/v1/preview.jpg")).status_code == 404
         assert (await client.post("/v1/services/rotation.verify_profile")).json() == {"differences": []}

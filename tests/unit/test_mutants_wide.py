@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.mutants_wide import API, DRIVERS, MUTANTS, RUNTIME, Mutant, copy_tree, misfit, table, try_mutant
+from harness.mutants_wide import API, DRIVERS, MUTANTS, RUNTIME
+from harness.seeded import Mutant, copy_tree, misfit, table, try_mutant
 
 ROOT = Path(__file__).parents[2]
 

@@ -155,7 +155,7 @@ class Worker:
                 self._save(self._to_save.get(), frame, attitude)
             if self._preview_wanted.is_set():
                 self._preview_wanted.clear()
-                self._send(Preview(jpeg_base64=_jpeg(classifier, frame, observation)))
+                self._send(Preview(capture_s=frame.capture_s, jpeg_base64=_jpeg(classifier, frame, observation)))
 
     def _save(self, wanted: SaveFrame, frame: Frame, attitude: MeasuredAttitude) -> None:
         problem = ""
