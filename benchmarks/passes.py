@@ -51,7 +51,7 @@ START_DEG = (-30.0, 0.0, 30.0, 45.0)
 SPEEDS_M_PER_S = (0.25, 0.5, 1.0)
 SEEDS = (1, 2, 3)
 POLL_S = 0.05
-DRIVEN_N = 3
+DRIVEN_N = 5
 RIGHT_BAR, WIDTH_BAR = 0.97, 0.95
 
 
@@ -207,20 +207,21 @@ def cases(options: argparse.Namespace) -> list[Case]:
 
 async def in_processes(asked: list[Case]) -> list[Outcome]:
     """All passes on one rig and daemon. One that a fault disturbed (a busy machine makes pictures too old) is told, and
-    driven again, at most twice."""
+    driven again, at most four times."""
     outcomes = []
     async with stack() as machine:
         for case in asked:
-            for left in reversed(range(DRIVEN_N)):
+            outcome: Outcome | None = None
+            for _ in range(DRIVEN_N):
                 try:
                     outcome = show(await machine.drive_pass(case))
                 except (RuntimeError, TimeoutError) as error:  # a fault ended it before it began
                     print(f"{case}: {error or 'timed out'}", file=sys.stderr, flush=True)
-                    if left:
-                        continue
-                    raise
+                    continue
                 if not outcome.note:
                     break
+            if outcome is None:
+                raise RuntimeError(f"{case}: not driven in {DRIVEN_N} attempts")
             outcomes.append(outcome)
     return outcomes
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.hal.camera import Frame
 from graderd.perception import CameraCalibration, PerceptionSettings
@@ -26,6 +27,8 @@ from graderd.simulator.grader.world import scene_heights
 OUT = Path("docs/pictures")
 ANGLE_DEG = 20.0
 SIZE = (480, 300)
+ON_GROUND = MeasuredAttitude(2.0, 0.0, 0.0)
+"""What the lifts and the tilt measure."""
 
 
 def photograph(look: Appearance) -> Frame:
@@ -58,7 +61,7 @@ def main() -> None:
     brown = photograph(Appearance(soil="loam", ground="concrete", blade="steel"))
     paper = SoilClassifier(PerceptionSettings(method="paper"), calibration, blade, live=False)
     filtered, mask, contour = paper_steps(brown.color_bgr, PerceptionSettings().color)
-    said = paper.classify(brown, ANGLE_DEG, 0.0)
+    said = paper.classify(brown, ANGLE_DEG, 0.0, ON_GROUND)
     save(
         "perception-paper.jpg",
         [
@@ -69,8 +72,8 @@ def main() -> None:
         ],
     )
     hard = photograph(Appearance(soil="gravel", ground="plywood", blade="rusty", red_cast=0.25))
-    fused = SoilClassifier(PerceptionSettings(), calibration, blade, live=False)
-    soil = fused.height_map(hard, Stance(ANGLE_DEG))
+    judge = SoilClassifier(PerceptionSettings(), calibration, blade, live=False)
+    soil = judge.height_map(hard, Stance(ANGLE_DEG, ON_GROUND))
     assert soil is not None
     assert hard.depth_mm is not None
     shade = np.clip(hard.depth_mm / 1700 * 255, 0, 255).astype(np.uint8)
@@ -81,15 +84,17 @@ def main() -> None:
     hidden = cv2.resize((~soil.seen.T).astype(np.uint8), SIZE, interpolation=cv2.INTER_NEAREST)
     plan = np.asarray(cv2.applyColorMap(tall, cv2.COLORMAP_VIRIDIS), dtype=np.uint8)
     plan[(hidden > 0) & (np.indices(hidden.shape).sum(axis=0) % 6 < 2)] = 255
-    said = fused.classify(hard, ANGLE_DEG, 0.0)
+    said = judge.classify(hard, ANGLE_DEG, 0.0, ON_GROUND)
     wrong = SoilClassifier(PerceptionSettings(method="fast_color"), calibration, blade, live=False)
     save(
         "perception-depth.jpg",
         [
             titled(depth, "depth picture"),
             titled(plan, "height map from above; hatched: filled in"),
-            titled(fused.annotate(hard, said), "fused"),
-            titled(wrong.annotate(hard, wrong.classify(hard, ANGLE_DEG, 0.0)), "fast_color on the same frame"),
+            titled(judge.annotate(hard, said), "depth, the default"),
+            titled(
+                wrong.annotate(hard, wrong.classify(hard, ANGLE_DEG, 0.0, ON_GROUND)), "fast_color on the same frame"
+            ),
         ],
     )
 

@@ -98,6 +98,7 @@ def sections(state: dict[str, Any]) -> list[Section]:
         ("vehicle", _vehicle(state["vehicle"])),
         ("blade", _attitude(state["attitude"])),
         ("camera", _camera(state["camera"])),
+        *([("camera set", as_set)] if (as_set := _as_set(state["camera"]["settings_read_back"])) else []),
         ("tick", _tick(state["tick"])),
     ]
     found: list[Section] = [(f"graderd {state['version']} ({where})", ("", ""), [tuple(row) for row in overview])]
@@ -184,6 +185,11 @@ def _attitude(attitude: dict[str, Any]) -> str:
 def _camera(camera: dict[str, Any]) -> str:
     restarts = f", restarted {camera['restarts_n']} times" if camera["restarts_n"] else ""
     return f"{camera['lifecycle']} {camera['description']}{restarts}".strip()
+
+
+def _as_set(read_back: dict[str, float]) -> str:
+    """What the camera itself says it is set to, colour and depth sensor."""
+    return ", ".join(f"{name} {value:g}" for name, value in read_back.items())
 
 
 def _tick(tick: dict[str, Any]) -> str:

@@ -42,24 +42,29 @@ BANDS_M = (0.14, 0.10, 0.07, 0.05, 0.035, 0.025, 0.02, 0.015, 0.012)
 COLOR_ONLY_BANDS_M = (0.05, 0.04, 0.03, 0.02, 0.015, 0.012, 0.012, 0.012)
 """Further away, any edge of a picture may pass for the blade's."""
 DEPTH_SIGMA_M = 0.003
+"""What a depth point is off: 0.1 to 0.2 px of disparity at 0.8 m."""
 COLOR_SIGMA_PX = 1.0
+"""What an edge's place in the picture is off."""
 COLOR_TOP_SIGMA_PX = 6.0
 """From above, the plate's thickness shows behind the upper edge: where depth tells, colour has little say there."""
 PRIOR_SIGMA = np.array([0.5, 0.5, 0.5, 30.0, 30.0, 30.0, 0.02, 0.03, 0.03, 0.1, 5.0, 15.0])
 """How far a number may plausibly be from where it starts: metres and degrees. Decides only what is not seen."""
 AS_DRAWN_SIGMA_M = 0.0005
+"""What is not solved is held to its drawing by this."""
 AS_MEASURED_SIGMA = (0.0005, 0.05, 0.05)
+"""Height (m), slope and pitch (deg) that the lifts and the tilt measure are held to by this."""
 OFF_DRAWING_M = 0.02
 """A blade that differs from its drawing by more than this is another blade, or was not where it was said to be."""
 COLOR_ONLY_SIGMA_M = 0.003
 """Without depth the picture tells only ratios: the blade's size must be known, and sets the scale."""
-MIN_FRAMES_N = 3
-MIN_SPAN_DEG = 20.0
-MAX_RESIDUAL_MM = 12.0
-MAX_RESIDUAL_PX = 6.0
+MIN_FRAMES_N, MIN_SPAN_DEG = 3, 20.0
+"""Frames, and blade angles between the outermost: with less, place and angle of the camera are not told apart."""
+MAX_RESIDUAL_MM, MAX_RESIDUAL_PX = 12.0, 6.0
+"""A fit worse than this fitted something else: a good mount gives 1 mm and 1 px."""
 MIN_AGREEMENT = 0.5
-MAX_UNCERTAIN_MM = 10.0
-MAX_UNCERTAIN_DEG = 1.0
+"""Of the points near the face so many lie on it; fewer, and the angle of the frame is not the blade's."""
+MAX_UNCERTAIN_MM, MAX_UNCERTAIN_DEG = 10.0, 1.0
+"""A camera's place less sure than this would make soil of ground."""
 
 
 class CalibrationError(Exception):

@@ -31,7 +31,7 @@ from graderd.perception.forms import (
     standing,
     steep_cells,
 )
-from graderd.perception.geometry import F32, F64, U8, View, third_outlines_px
+from graderd.perception.geometry import F32, F64, NOMINAL_WIDTH_PX, U8, View, third_outlines_px
 from graderd.perception.ground import Ground, GroundFit
 from graderd.perception.registration import BladeFinder, BladeFix, Stance, UpperEdge
 from graderd.perception.settings import DecisionSettings, DepthSettings
@@ -40,13 +40,17 @@ I64 = npt.NDArray[np.intp]
 Litres = tuple[float, float, float]
 NOTHING: Litres = (0.0, 0.0, 0.0)
 
-NOMINAL_WIDTH_PX = 848
+LEAST_CELLS_N = 6
+"""A map of fewer cells along the blade or ahead of it, on a toy's blade, would show no form."""
 KEPT_GRIDS_N = 64
+"""Thirds of the picture are kept for so many blade angles, a degree apart: 1 MB."""
 CONTEXT_M = 0.14
 """The height map goes on so far beyond the reach: what stands at its border is judged by what stands before it."""
 BESIDE_RATIO = 0.87
 """And beyond both ends of the blade by this part of the travel looked ahead: the sine of 60 degrees, as far as a blade
 turns; one turned further looks less far ahead at its leading end."""
+BEHIND_M = 0.16
+"""And so far behind the face points are kept: a face that is knocked back is found there."""
 STANDING_REACH_M = 0.60
 """So far ahead of the face what stands is looked for: a person a step before the soil's zone."""
 SUNK_M = 0.017
@@ -77,7 +81,6 @@ class HeightMap:
 
     height_m: F64
     seen: Bools
-    threshold_m: float
     volumes_l: Litres
     carried_l: Litres
     ahead_l: Litres
@@ -113,8 +116,8 @@ class DepthJudge:
             blade, view.position_m, settings.ground_offset_limit_m, settings.ground_slope_limit_deg
         )
         self._finder = BladeFinder(view, blade)
-        self._along_n = max(6, 3 * round(blade.length_m / settings.cell_m / 3))
-        self._ahead_n = max(4, round(blade.reach_m / settings.cell_m))
+        self._along_n = max(LEAST_CELLS_N, 3 * round(blade.length_m / settings.cell_m / 3))
+        self._ahead_n = max(LEAST_CELLS_N, round(blade.reach_m / settings.cell_m))
         self._cell_s_m = blade.length_m / self._along_n
         self._cell_d_m = blade.reach_m / self._ahead_n
         self._context_n = round(CONTEXT_M / self._cell_d_m)
@@ -138,9 +141,7 @@ class DepthJudge:
         s, d, z = self._in_blade(points, ground, angle_deg)
         # Some way behind and beside the blade too, where its face is looked for.
         wide = np.float32(blade.length_m / 2 + self._travel_m * BESIDE_RATIO)
-        pixels = np.flatnonzero(
-            (np.abs(d - np.float32(0.22)) < np.float32(STANDING_REACH_M - 0.22)) & (np.abs(s) < wide)
-        )
+        pixels = np.flatnonzero((d > np.float32(-BEHIND_M)) & (d < np.float32(STANDING_REACH_M)) & (np.abs(s) < wide))
         s, d, z, raw_z = s[pixels], d[pixels], z[pixels], points[2][pixels]
         above_edge = self._above_edge(s, z, raw_z, edge, stance)
         lean = np.float32(stance.lean) * np.clip(above_edge, 0, np.float32(blade.height_m))
@@ -233,6 +234,11 @@ class DepthJudge:
             return verdict.unknown(
                 f"{things_l:.1f} l lie there whose form is not soil's, or hidden by noise, dust or drops"
             )
+        most_doubtful_l = settings.form.doubtful_most_percent / 100 * sum(amounts_l)
+        if verdict.zone is not Zone.NONE and sum(doubtful_l) > most_doubtful_l:
+            return verdict.unknown(
+                f"{sum(doubtful_l):.1f} of {sum(amounts_l):.1f} l lie beside what has not soil's form"
+            )
         if any(doubtful_l):
             without = decide(_less(amounts_l, doubtful_l), settings.none_volume_l, "l", self._decision)
             if without.zone is not verdict.zone:
@@ -282,7 +288,7 @@ class DepthJudge:
         for third, outline in enumerate(third_outlines_px(self._view, self._blade, angle_deg)):
             if np.isfinite(outline).all():
                 places = (outline - self._stride // 2) / self._stride
-                cv2.fillPoly(grid, [np.round(places * 16).astype(np.int32)], third, shift=4)
+                cv2.fillPoly(grid, [np.round(places * (1 << 4)).astype(np.int32)], third, shift=4)
         return grid.ravel(), tuple(int(n) for n in np.bincount(grid.ravel(), minlength=4))
 
     def _noise_m(self, ground: Ground, angle_deg: float) -> F64:
@@ -331,7 +337,6 @@ class DepthJudge:
         return HeightMap(
             filled[self._before],
             seen[self._before],
-            threshold,
             volumes_l,
             carried_l,
             ahead_l,
@@ -378,6 +383,9 @@ def _less(one: Litres, other: Litres) -> Litres:
 CREST_M = 0.06
 """A carried heap is highest within so much of the face; between crest and face the camera sees nothing."""
 
+PLACES_N = 5
+"""The three thirds, and what lies beyond either end."""
+
 ThirdsL = tuple[float, float, float]
 
 
@@ -414,8 +422,8 @@ def split_soil(
     met = _third(met_s, blade)
     met[np.broadcast_to(met_m > travel_m, met.shape)] = 0
     litres = 1000.0 * cells.area_m2
-    leaning = np.bincount(_third(cells.s_m, blade), weights=carried.sum(axis=1), minlength=5) * litres
-    coming = np.bincount(met.ravel(), weights=(height_m - carried).ravel(), minlength=5) * litres
+    leaning = np.bincount(_third(cells.s_m, blade), weights=carried.sum(axis=1), minlength=PLACES_N) * litres
+    coming = np.bincount(met.ravel(), weights=(height_m - carried).ravel(), minlength=PLACES_N) * litres
     return _inner(leaning), _inner(coming)
 
 

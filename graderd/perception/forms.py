@@ -24,6 +24,7 @@ Counts = npt.NDArray[np.integer[Any]]
 UNSEEN = 10.0
 """Stands for a height that is not known, metres."""
 STEEP_TOLERANCE_M = 0.02
+"""So far above what could rise there a cell is steep: the noise of a cell's mean is 2 to 6 mm."""
 OWN_SPREAD_M = 0.020
 """Heights in one cell spread by this: steep whatever its neighbours are (soil at 60 degrees: 10 mm)."""
 GAP_SPREAD_M = 0.040
@@ -31,6 +32,7 @@ GAP_SPREAD_M = 0.040
 HANGS_M = 0.08
 """So far above what could rise there: it hangs (a hose, an arm of the machine); what stands is found by standing()."""
 ROW_CELLS_N = 5
+"""Cells in a row that are judged together: 10 cm, as wide as a boot or a pipe."""
 SLOPE_NOISE_RATIO = 2.0
 """Noise along the line of sight lifts points of a slope that faces the camera twice as much as those of ground."""
 CELL_M = 0.04
@@ -41,18 +43,22 @@ LEVELS_N = 8
 """So many in a row without a gap: soil at 60 degrees crosses six of them within a column's diagonal, a leg all."""
 LEVEL_POINTS_N = 2
 """Points in a level: a single one may be a wrong match."""
-LOWEST_M = 0.04
+LOWEST_M, HIGHEST_M = 0.04, 0.52
+"""What stands is looked for between these heights: lower there is soil, higher the camera and the machine's arms."""
 LOW_STARTS_N = 6
 """It must begin below 16 cm, or on soil beside it: what hangs from above (hoses, the machine's arms) does not stand."""
 ON_SOIL_STARTS_N = 8
 """On soil too it begins below 20 cm: higher, the machine's arms touch a heap that fills the blade."""
 BESIDE_COLUMNS_N = 2
-HIGHEST_M = 0.52
+"""Soil beside an upright column is what shows in columns so near."""
 STANDING_FROM_M = 0.06
 """Nearer to the face than this, the face itself may show."""
 STANDING_COLUMNS_N = 2
+"""So many columns must stand: one may be a rod or a hose, and a leg is 6 cm wide at least."""
 TALL_M = 0.03
 """Cells lower than this say nothing about form: their steepness drowns in noise."""
+FOOT_CELLS_N = 3
+"""A heap's foot runs out below the level at which lumps are told apart: so many cells more count."""
 BESIDE_CELLS_N = 2
 """Cells so near to a steep one are not clear of it."""
 
@@ -95,8 +101,7 @@ def sort_out(
     weak = ~stands & ~is_thing
     weak[0] = False
     soil, things = stands[labels], is_thing[labels]
-    # A heap's foot runs out below the level at which lumps are told apart: three cells more, up and down alike.
-    foot = cv2.dilate(soil.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    foot = cv2.dilate(soil.astype(np.uint8), np.ones((2 * FOOT_CELLS_N + 1,) * 2, np.uint8)) > 0
     soil = foot & ~things & ~weak[labels]
     touched = cv2.dilate((steep & seen).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return Forms(soil, soil & touched, things, weak[labels])

@@ -23,6 +23,8 @@ U8 = npt.NDArray[np.uint8]
 RIGHT, CENTER, LEFT = 0, 1, 2
 """Index of a third, counted along growing s; left is the operator's."""
 
+NOMINAL_WIDTH_PX = 848
+"""Numbers in pixels of the depth picture are meant for one so wide."""
 NEAR_M = 0.05
 """Nothing nearer than this to the camera is projected."""
 

@@ -17,36 +17,63 @@ import numpy.typing as npt
 from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.hal.camera import DepthImage
-from graderd.perception.geometry import F32, F64, View, blade_points_m, face_setback_m, middle
+from graderd.perception.geometry import F32, F64, NOMINAL_WIDTH_PX, View, blade_points_m, face_setback_m, middle
 from graderd.perception.ground import Ground
 
-NOMINAL_WIDTH_PX = 848
-FACE_POINTS_N = 2000
-FACE_BAND_M = 0.16
-"""The face is looked for from its upper edge down to here."""
-PLACE_M = 0.01
-LEVEL_M = 0.015
+SEARCH_M = 0.09
+"""The face is looked for so far ahead and behind: the camera's mount 2 cm and 2 degrees off, a tyre soft."""
+COLUMNS_N = 12
+"""The blade's length is judged in so many columns, 8 cm each: wide enough to hold points, narrow enough for a heap."""
+SEEN_LEAST_N = COLUMNS_N // 3
+"""With the face seen in fewer its direction would rest on one place of it."""
+FACE_LEAST_N, FACE_POINTS_N = 40, 2000
+"""Points on the face: with fewer nothing is said, and more tell nothing new."""
+FACE_BAND_M, FACE_BELOW_TOP_M = 0.16, 0.01
+"""The face is looked for from so far below its upper edge up to so far: lower there is soil, higher what is behind."""
+PLACE_M, LEVEL_M = 0.01, 0.015
+"""What is upright is looked for in places (along the travel) and levels of this size: noise is 2 to 6 mm."""
+UPRIGHT_LEVELS_N = 4
+"""Soil at 45 degrees shows in no more than 3 levels within two places (2 cm)."""
 ON_FACE_M = 0.015
-"""Points so near to the face lie on it."""
+"""Points so near to the face lie on it: twice the noise of what is furthest."""
 BEHIND_VOTES = 2.0
 """What is seen behind a face speaks against it by so many columns: nothing is seen through the blade."""
 TURN_VOTES = 15.0
 """A face turned against the measured angle by 4 degrees needs one column more."""
 APART_COLUMNS_N = 3
-"""The face's direction is taken from columns so far apart at least."""
+"""The face's direction is taken from columns so far apart at least: 25 cm, over which noise is 2 degrees."""
+ENDS_LEAST_N, ENDS_RANK = 60, 0.007
+"""Points on the face from which its ends are taken, and the share beyond either end that is wrong matches."""
+ENDS_LENGTH_M = 0.05
+"""What is seen of the face is shorter or longer than it by this: an end is hidden, and its middle says nothing."""
+TOP_COLUMNS_N = 24
+"""The upper edge is looked for down so many columns of the picture, 4 cm apart; a third of them must show it."""
+TOP_MARGIN_M = 0.04
+"""So far within the ends: beyond them the edge is not, with the blade 2 cm off its place."""
+TOP_SEARCH_PX = 36
+"""The upper edge is looked for so far above and below where it should be, at 848 pixels across: 7 cm."""
 ABOVE_PX = np.arange(1, 7)
 """Steps above the upper edge in which nothing may stand nearer, and what lies behind must show."""
-UPRIGHT_LEVELS_N = 4
-"""Soil at 45 degrees shows in no more than 3 levels within two places (2 cm)."""
-TOP_COLUMNS_N = 24
-EDGE_ANGLE_STEP_DEG = 0.5
-EDGE_HEIGHT_STEP_MM = 10.0
-EDGE_LEAN_STEP_DEG = 2.0
-KEPT_COLUMNS_N = 256
+STEP_M = 0.08
+"""What is nearer or further than the edge by this is not the blade's: its plate and its ribs are thinner."""
+TOP_SHARE = 0.4
+"""The edge's rise is taken from what is seen of it, where that is this part of its length; else from the lifts."""
+TOP_APART_M = 0.1
+"""Two places on it nearer than this tell noise, not slope."""
 BODY_BELOW_M = (0.05, 0.13)
 """Heights below the upper edge at which the face is probed."""
-TOP_SEARCH_PX = 36
-"""The upper edge is looked for so far above and below where it should be, at 848 pixels across."""
+BODY_SHARE = 0.45
+"""So far to both sides of the middle, as a part of the length."""
+UPRIGHT_M = 0.03
+"""Two places above each other on a face lie as far ahead, to this; on soil at 60 degrees 5 cm apart."""
+THROUGH_M = 0.2
+"""So far behind the face: what is seen lies behind the blade, which is not there."""
+EDGE_ANGLE_STEP_DEG, EDGE_HEIGHT_STEP_MM, EDGE_LEAN_STEP_DEG = 0.5, 10.0, 2.0
+"""Stances that differ by less share their columns: the edge stays well within where it is looked for."""
+KEPT_COLUMNS_N = 256
+"""So many are kept: 2 MB."""
+TABLE_FROM_M, TABLE_TO_M, TABLE_STEP_M = -0.2, 0.8, 0.001
+"""Heights above the edge for which the face's hollow is tabled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,28 +159,27 @@ class _EdgeColumns:
 class BladeFinder:
     """Finds the moldboard's face and ends in the points, given roughly where they are."""
 
-    SEARCH_M = 0.09
-    COLUMNS_N = 12
-
     def __init__(self, view: View, blade: BladeGeometry) -> None:
         self._view = view
         self._all_rays = view.rays()
         self._position = view.position_m.astype(np.float32)
         self._columns: dict[tuple[int, int, int, int], _EdgeColumns | None] = {}
         self._blade = blade
-        table = np.linspace(-0.2, 0.8, 1001)
+        table = np.arange(TABLE_FROM_M, TABLE_TO_M, TABLE_STEP_M)
         self._setback = face_setback_m(blade, table + blade.bottom_z_m).astype(np.float32)
-        self._hollow_m2 = np.cumsum(np.where(table > 0, self._setback, 0.0)) * 0.001
+        self._hollow_m2 = np.cumsum(np.where(table > TABLE_STEP_M / 2, self._setback, 0.0)) * TABLE_STEP_M
 
     def setback(self, above_edge: npt.NDArray[np.floating]) -> F32:
         """Set-back of the hollow face, standing upright, at heights above its cutting edge (table look-up, 1 mm)."""
-        index = np.clip((above_edge + 0.2) * 1000.0, 0, 1000).astype(np.int32)
-        return np.asarray(self._setback[index], dtype=np.float32)
+        return np.asarray(self._setback[self._index(above_edge)], dtype=np.float32)
 
     def hollow_m2(self, above_edge: F64) -> F64:
         """Area between the hollow face and its edges' plane, from the cutting edge up to these heights."""
-        index = np.clip((above_edge + 0.2) * 1000.0, 0, 1000).astype(np.int32)
-        return np.asarray(self._hollow_m2[index], dtype=np.float64)
+        return np.asarray(self._hollow_m2[self._index(above_edge)], dtype=np.float64)
+
+    def _index(self, above_edge: npt.NDArray[np.floating]) -> npt.NDArray[np.int32]:
+        place = (above_edge - np.float32(TABLE_FROM_M)) * np.float32(1 / TABLE_STEP_M)
+        return np.asarray(np.clip(place, 0, self._setback.size - 1), dtype=np.int32)
 
     def upper_edge(self, depth_mm: DepthImage, stance: Stance, ground: Ground) -> UpperEdge | None:
         """Where the upper edge is; None where it cannot be told.
@@ -172,20 +198,20 @@ class BladeFinder:
         d = at[..., 0] * cos + at[..., 1] * sin - np.float32(blade.x_offset_m)
         tall = np.float32(stance.tall_m(blade))
         off = d + self.setback(tall - below) - np.float32(stance.lean) * np.clip(tall - below, 0, tall)
-        face = (z_optical > 0) & (np.abs(off) < self.SEARCH_M)
+        face = (z_optical > 0) & (np.abs(off) < SEARCH_M)
         column, first = np.arange(len(z_optical)), face.argmax(axis=1)
         free = face.any(axis=1) & (first > 0)
         edge_m = z_optical[column, first]
         over = z_optical[column[:, None], np.maximum(first[:, None] - ABOVE_PX, 0)] - edge_m[:, None]
         nothing = over == -edge_m[:, None]
-        free &= (nothing | (over > -0.08)).all(axis=1)
-        free &= (over > 0.08).sum(axis=1) >= 2  # what has no depth may be nearer as well
+        free &= (nothing | (over > -STEP_M)).all(axis=1)
+        free &= (over > STEP_M).sum(axis=1) >= 2  # what has no depth may be nearer as well
         if free.sum() < TOP_COLUMNS_N // 3:
             return None
         x, y, z = (at[column[free], first[free], axis].astype(np.float64) for axis in range(3))
         s = y * cos - x * sin
         over_ground = z - ground.height_at(x, y)
-        rise = _median_slope(s, z) if s.max() - s.min() > 0.4 * blade.length_m else stance.rise
+        rise = _median_slope(s, z) if s.max() - s.min() > TOP_SHARE * blade.length_m else stance.rise
         tilted = rise - float(ground.slope_y * cos - ground.slope_x * sin)
         return UpperEdge(middle(z - rise * s), rise, middle(over_ground - tilted * s))
 
@@ -208,9 +234,9 @@ class BladeFinder:
         if valid.sum() < TOP_COLUMNS_N // 3:
             return BladeFix()
         face = face[valid]
-        upright = np.abs(face[:, 0] - face[:, 1]) < 0.03
-        through = face.max(axis=1) < -0.2
-        elsewhere = through | (upright & (np.abs(face[:, 0]) > self.SEARCH_M))
+        upright = np.abs(face[:, 0] - face[:, 1]) < UPRIGHT_M
+        through = face.max(axis=1) < -THROUGH_M
+        elsewhere = through | (upright & (np.abs(face[:, 0]) > SEARCH_M))
         return BladeFix(missing=float(elsewhere.mean()))
 
     def _edge_columns(self, stance: Stance) -> _EdgeColumns | None:
@@ -218,7 +244,7 @@ class BladeFinder:
         key = stance.steps()
         if key in self._columns:
             return self._columns[key]
-        lens, half = self._view.lens, self._blade.length_m / 2 - 0.04
+        lens, half = self._view.lens, self._blade.length_m / 2 - TOP_MARGIN_M
         edge = self._on_face(stance, np.linspace(-half, half, TOP_COLUMNS_N), 0.0)
         scale = lens.width / NOMINAL_WIDTH_PX
         reach, stride = round(TOP_SEARCH_PX * scale), max(1, round(2 * scale))
@@ -245,7 +271,7 @@ class BladeFinder:
 
     def _body(self, stance: Stance) -> tuple[npt.NDArray[np.intp], F32]:
         lens = self._view.lens
-        s = np.linspace(-0.45, 0.45, TOP_COLUMNS_N) * self._blade.length_m
+        s = np.linspace(-BODY_SHARE, BODY_SHARE, TOP_COLUMNS_N) * self._blade.length_m
         both = np.round(np.stack([self._on_face(stance, s, below_m) for below_m in BODY_BELOW_M], axis=1))
         seen = np.isfinite(both).all(axis=(1, 2)) & (both >= 0).all(axis=(1, 2))
         seen &= (both[..., 0] < lens.width).all(axis=1) & (both[..., 1] < lens.height).all(axis=1)
@@ -257,19 +283,23 @@ class BladeFinder:
         ``above_edge`` how far above the cutting edge, of a blade ``tall_m`` from edge to edge."""
         blade = self._blade
         half = blade.length_m / 2
-        upper = (above_edge > tall_m - FACE_BAND_M) & (above_edge < tall_m - 0.01) & (np.abs(s) < half + self.SEARCH_M)
-        near = np.flatnonzero(upper & (np.abs(face) < self.SEARCH_M))
-        if near.size < 40:
+        upper = (
+            (above_edge > tall_m - FACE_BAND_M)
+            & (above_edge < tall_m - FACE_BELOW_TOP_M)
+            & (np.abs(s) < half + SEARCH_M)
+        )
+        near = np.flatnonzero(upper & (np.abs(face) < SEARCH_M))
+        if near.size < FACE_LEAST_N:
             return BladeFix()
         near = near[:: max(1, near.size // FACE_POINTS_N)]
         near_s, near_face = s[near], face[near]
-        column = ((near_s + np.float32(half)) * np.float32(self.COLUMNS_N / blade.length_m)).astype(np.int32)
-        inside = (column >= 0) & (column < self.COLUMNS_N)
+        column = ((near_s + np.float32(half)) * np.float32(COLUMNS_N / blade.length_m)).astype(np.int32)
+        inside = (column >= 0) & (column < COLUMNS_N)
         face_at, upright = self._upright(
             column[inside], near_face[inside], np.float32(tall_m) - above_edge[near][inside]
         )
-        s_at = (np.flatnonzero(upright) + 0.5) / self.COLUMNS_N * blade.length_m - half
-        if s_at.size < self.COLUMNS_N // 3:
+        s_at = (np.flatnonzero(upright) + 0.5) / COLUMNS_N * blade.length_m - half
+        if s_at.size < SEEN_LEAST_N:
             return BladeFix()
         ahead, slope = _line_of_most(s_at, face_at)
         on_face = np.abs(near_face - np.float32(ahead) - np.float32(slope) * near_s) < ON_FACE_M
@@ -282,32 +312,32 @@ class BladeFinder:
         What stands upright shows at the same place at many heights. Soil that leans on the face, up to the edge where
         the blade casts it aside, shows at each height at another place; hoses and rods are narrow and lie ahead.
         """
-        places_n = round(2 * self.SEARCH_M / PLACE_M)
-        place = ((face + np.float32(self.SEARCH_M)) * np.float32(1 / PLACE_M)).astype(np.int32)
+        places_n = round(2 * SEARCH_M / PLACE_M)
+        place = ((face + np.float32(SEARCH_M)) * np.float32(1 / PLACE_M)).astype(np.int32)
         place = np.minimum(place, places_n - 1)
         levels_n = round(FACE_BAND_M / LEVEL_M)
         level = np.minimum((np.maximum(below_m, 0) * np.float32(1 / LEVEL_M)).astype(np.int32), levels_n - 1)
-        shape = (self.COLUMNS_N, places_n, levels_n)
+        shape = (COLUMNS_N, places_n, levels_n)
         index = (column * places_n + place) * levels_n + level
-        shown = np.bincount(index, minlength=self.COLUMNS_N * places_n * levels_n).reshape(shape) > 0
+        shown = np.bincount(index, minlength=COLUMNS_N * places_n * levels_n).reshape(shape) > 0
         two = shown[:, 1:] | shown[:, :-1]  # a face lies across the bound of two places as well as on one
         tall = two.sum(axis=2)
         best = tall.argmax(axis=1)  # the rearmost where several are as tall
-        upright = tall[np.arange(self.COLUMNS_N), best] >= UPRIGHT_LEVELS_N
+        upright = tall[np.arange(COLUMNS_N), best] >= UPRIGHT_LEVELS_N
         on_it = (place == best[column]) | (place == best[column] + 1)
         on_it &= upright[column]
-        count = np.bincount(column[on_it], minlength=self.COLUMNS_N)
-        total = np.bincount(column[on_it], weights=face[on_it], minlength=self.COLUMNS_N)
+        count = np.bincount(column[on_it], minlength=COLUMNS_N)
+        total = np.bincount(column[on_it], weights=face[on_it], minlength=COLUMNS_N)
         return np.asarray(total[upright] / count[upright], dtype=np.float64), upright
 
     def _ends(self, s: F32) -> float:
-        if s.size < 60:
+        if s.size < ENDS_LEAST_N:
             return 0.0
-        rank = s.size * 7 // 1000
+        rank = int(s.size * ENDS_RANK)
         ranked = np.partition(s, (rank, s.size - 1 - rank))
         low, high = ranked[rank], ranked[s.size - 1 - rank]
         length = self._blade.length_m
-        if abs((high - low) - length) > 0.05:
+        if abs((high - low) - length) > ENDS_LENGTH_M:
             return 0.0  # an end is hidden; the middle of what is seen says nothing
         return float(low + high) / 2
 
@@ -345,5 +375,5 @@ def _median_slope(s: F64, z: F64) -> float:
     """Slope of a line through points of which some lie elsewhere (Theil and Sen)."""
     first, second = _pairs(s.size, 1)
     apart = s[second] - s[first]
-    wide = np.abs(apart) > 0.1
+    wide = np.abs(apart) > TOP_APART_M
     return middle((z[second] - z[first])[wide] / apart[wide]) if wide.any() else 0.0

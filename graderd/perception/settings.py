@@ -137,6 +137,9 @@ class FormSettings(Settings):
         default=7.0,
         description="more than this without the form of soil is soil seen badly, or a heap of things: unknown",
     )
+    doubtful_most_percent: Percent = Field(
+        default=50.0, description="soil of which more than this lies beside something steep is dust, or buried: unknown"
+    )
     lowest_m: Positive = Field(default=0.006, description="what is lower than this is ground")
 
 
@@ -160,7 +163,10 @@ class DepthSettings(Settings):
         default=8.0, description="ground tilted more than this is not judged (14 %)"
     )
     form: FormSettings = Field(default_factory=FormSettings)
-    min_valid_percent: Percent = Field(default=35.0, description="less depth than this in front of the blade: unknown")
+    min_valid_percent: Percent = Field(
+        default=45.0,
+        description="less depth than this before a third: unknown (500 scenes without mud have 53 and more)",
+    )
     none_volume_l: Positive = Field(default=1.2, description="less soil than this in front of the whole blade: none")
     ahead_min_percent: Percent = Field(
         default=20.0,

@@ -90,6 +90,15 @@ async def test_status_for_people_shows_what_matters(tmp_path: Path, capsys: Capt
         assert "\x1b" not in out
 
 
+async def test_what_the_camera_is_set_to_is_shown_as_the_camera_says_it(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, _):
+        status = daemon.status().model_dump(mode="json")
+    assert "camera set" not in {row[0]: row[1] for row in sections(status)[0][2]}
+    status["camera"]["settings_read_back"] = {"exposure_us": 8000.0, "depth_emitter": 1.0, "depth_laser_mw": 150.0}
+    overview = {row[0]: row[1] for row in sections(status)[0][2]}
+    assert overview["camera set"] == "exposure_us 8000, depth_emitter 1, depth_laser_mw 150"
+
+
 async def test_what_arming_needs_and_what_it_goes_without_are_told_apart(tmp_path: Path) -> None:
     async with serving(tmp_path) as (daemon, _):
         status = daemon.status().model_dump(mode="json")
