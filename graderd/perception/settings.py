@@ -164,7 +164,7 @@ class DepthSettings(Settings):
     )
     form: FormSettings = Field(default_factory=FormSettings)
     min_valid_percent: Percent = Field(
-        default=45.0,
+        default=40.0,
         description="less depth than this before a third: unknown (500 scenes without mud have 53 and more)",
     )
     none_volume_l: Positive = Field(default=1.2, description="less soil than this in front of the whole blade: none")
