@@ -13,6 +13,7 @@ from graderd.cli import (
     can,
     classify,
     config,
+    evaluate,
     explain,
     modes,
     move,
@@ -38,6 +39,7 @@ COMMANDS = (
     profile,
     can,
     classify,
+    evaluate,
     calibrate,
 )
 

@@ -1,4 +1,4 @@
-"""``python -m graderd.cli.docs [FOLDER]``: writes the pages that are made from data, docs/operators/{faults,cli}.md."""
+"""``python -m graderd.cli.docs [FOLDER]``: writes docs/operators/{faults,cli,study}.md, the pages made from data."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from graderd.cli.app import make_cli
 from graderd.cli.explain import lines
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import Clear, FaultRow, Reaction
+from graderd.evaluation import study
 
 HEADER = "<!-- Written by `python -m graderd.cli.docs`; change the source named below, not this page. -->\n"
 PARTS = {
@@ -42,7 +43,7 @@ CLEARS = {
 
 
 def main() -> None:
-    """Write both pages below the folder given, by default ``docs/operators``."""
+    """Write the pages below the folder given, by default ``docs/operators``."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "docs/operators")
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in pages().items():
@@ -52,7 +53,11 @@ def main() -> None:
 
 def pages() -> dict[str, str]:
     """Name and text of each page."""
-    return {"faults.md": faults_page(), "cli.md": cli_page()}
+    return {
+        "faults.md": faults_page(),
+        "cli.md": cli_page(),
+        "study.md": f"{HEADER}\n{study.page(study.evaluated())}",
+    }
 
 
 def faults_page() -> str:

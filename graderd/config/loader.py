@@ -123,12 +123,13 @@ def explain(
     *,
     where: str = "configuration",
     text: str = "",
+    file: str = "configuration",
 ) -> list[str]:
-    """One line per mistake. ``under``: where in the configuration ``model`` belongs."""
-    return [_explain(dict(each), model, list(under), where, text) for each in error.errors()]
+    """One line per mistake. ``under``: where in the file ``model`` belongs; ``file``: what kind of file that is."""
+    return [_explain(dict(each), model, list(under), where, text, file) for each in error.errors()]
 
 
-def _explain(error: dict[str, Any], model: type[BaseModel], under: list[str], where: str, text: str) -> str:
+def _explain(error: dict[str, Any], model: type[BaseModel], under: list[str], where: str, text: str, file: str) -> str:
     inner, parent = _place_of([str(part) for part in error["loc"]], model)
     location = under + inner
     name = _dotted(location)
@@ -140,7 +141,7 @@ def _explain(error: dict[str, Any], model: type[BaseModel], under: list[str], wh
         return f"{place}: {name}: unknown key. {remedy}"
     cause = error["msg"].removeprefix("Value error, ")
     given = "" if isinstance(error["input"], dict) else f" (given: {error['input']!r})"
-    return f"{place}: {name or 'configuration'}: {cause}{given}"
+    return f"{place}: {name or file}: {cause}{given}"
 
 
 def _dotted(location: list[str]) -> str:
@@ -148,28 +149,41 @@ def _dotted(location: list[str]) -> str:
 
 
 def _line_of(text: str, location: list[str]) -> int:
-    """Line number of the key, 0 where it cannot be told. TOML parsers keep none, so the text is searched."""
+    """Line number of the key, or of what it belongs in, 0 where it cannot be told. TOML parsers keep none, so the text
+    is searched."""
     key, table = location[-1] if location else "", _dotted(location[:-1])
     current = ""
+    lengths: dict[str, int] = {}  # of the arrays of tables so far, as far as this line
     for number, raw in enumerate(text.split("\n"), 1):
         line = raw.strip()
         if line.startswith("["):
-            current = line.strip("[]").strip()
+            *above, last = line.partition("#")[0].strip("[] ").split(".")
+            current = ""
+            for part in above:
+                current += part
+                current += f"[{lengths[current]}]." if current in lengths else "."
+            current += last
+            if line.startswith("[["):
+                lengths[current] = lengths.get(current, 0) + 1
+                current += f"[{lengths[current]}]"
             if current == _dotted(location):
                 return number
-        elif current == table and line.split("=")[0].strip().strip('"') == key:
+        elif current == table and line.split("=")[0].strip().strip('"') == key.partition("[")[0]:
             return number
-    return 0
+    return _line_of(text, location[:-1]) if len(location) > 1 else 0
 
 
 def _place_of(parts: list[str], model: type[BaseModel] | None) -> tuple[list[str], type[BaseModel] | None]:
     """Keys on the way to a mistake, and the model that the last of them belongs to.
 
     Where a section has several models, pydantic names the tag of the one it took after the section's key; a file has
-    no such word.
+    no such word. The elements of a list are counted from 1: ``trial[2]`` is the second.
     """
     location: list[str] = []
     while parts:
+        if location and parts[0].isdecimal():
+            location[-1] += f"[{int(parts.pop(0)) + 1}]"
+            continue
         location.append(parts.pop(0))
         if not parts:
             break
@@ -187,6 +201,6 @@ def _models_in(annotation: Any) -> dict[str, type[BaseModel]]:
         inner, *notes = typing.get_args(annotation)
         tag = next((note.tag for note in notes if isinstance(note, Tag)), None)
         return {tag or name: model for name, model in _models_in(inner).items()}
-    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType, list, tuple):
         return {name: model for each in typing.get_args(annotation) for name, model in _models_in(each).items()}
     return {}

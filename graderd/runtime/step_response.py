@@ -10,6 +10,7 @@ from html import escape
 from itertools import pairwise
 
 from graderd.hal.errors import DeviceMissingError
+from graderd.hal.rotator import Rotator
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.maneuver import Maneuver
 
@@ -21,7 +22,7 @@ _SETTLED_TAIL_S = 0.3
 
 @dataclass(frozen=True, slots=True)
 class StepSample:
-    """What one tick of the manoeuvre knew; times from its start."""
+    """One telemetry read of the manoeuvre; times from its start."""
 
     time_s: float
     goal_deg: float
@@ -64,7 +65,7 @@ class StepRecording:
     settings: dict[str, str] = field(default_factory=dict)
 
 
-async def step_samples(loop: ControlLoop, step_deg: float, dwell_s: float) -> list[StepSample]:
+async def step_samples(loop: ControlLoop, rotator: Rotator, step_deg: float, dwell_s: float) -> list[StepSample]:
     """Run the manoeuvre through machine and gate: what is measured is what the blade does in operation.
 
     It arms, starts and ends at the present angle, stays ``dwell_s`` from the start of each move, and disarms.
@@ -82,10 +83,16 @@ async def step_samples(loop: ControlLoop, step_deg: float, dwell_s: float) -> li
         began_s = loop.tick.now_s
 
         def sample(goal_deg: float) -> None:
-            told = loop.sensed.axes["rotation"].telemetry
-            if told.position:
-                current_a = told.current_a.value if told.current_a else None
-                samples.append(StepSample(told.position.time_s - began_s, goal_deg, told.position.value, current_a))
+            told = rotator.telemetry()
+            if told.angle_deg:
+                samples.append(
+                    StepSample(
+                        told.angle_deg.time_s - began_s,
+                        goal_deg,
+                        told.angle_deg.value,
+                        told.current_a.value if told.current_a else None,
+                    )
+                )
 
         for share in SHARES:
             goal_deg = start_deg + share * step_deg

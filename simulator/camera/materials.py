@@ -46,12 +46,19 @@ class StereoNoise:
         self._blobs = np.asarray(ranks / blobs.size, np.float32)
 
     def measure(
-        self, depth_m: Image32, fx: float, noise_px: float, hole_share: float, rng: np.random.Generator
+        self,
+        depth_m: Image32,
+        fx: float,
+        noise_px: float,
+        hole_share: float,
+        rng: np.random.Generator,
+        max_depth_m: float = MAX_DEPTH_M,
     ) -> DepthImage:
         """Depth as the camera gives it: uint16 millimetres along the optical axis, 0 = no value.
 
         ``depth_m``: true optical depth; ``fx``: focal length in pixels; ``noise_px``: standard deviation of the
-        disparity; ``hole_share``: share of pixels lost in blobs, besides those lost at edges; ``rng`` says which cut.
+        disparity; ``hole_share``: share of pixels lost in blobs, besides those lost at edges; ``rng`` says which cut;
+        ``max_depth_m``: what lies farther is not told, as the camera is set.
         """
         height, width = depth_m.shape
         disparity = np.float32(fx * BASELINE_M) / depth_m
@@ -63,7 +70,7 @@ class StereoNoise:
         if noise_px > 0.0:
             disparity += _cut(self._noise, height, width, rng) * np.float32(noise_px)
         measured = np.float32(fx * BASELINE_M * 1000.0) / np.maximum(disparity, np.float32(0.5))
-        lost |= (measured < MIN_DEPTH_M * 1000.0) | (measured > MAX_DEPTH_M * 1000.0)
+        lost |= (measured < MIN_DEPTH_M * 1000.0) | (measured > max_depth_m * 1000.0)
         result = np.asarray(measured + np.float32(0.5), np.uint16)
         result[lost] = 0
         return result

@@ -75,7 +75,7 @@ async def test_it_arms_turns_and_disarms(tmp_path: Path) -> None:
 @in_simulated_time
 async def test_a_step_response_goes_half_way_from_both_sides_and_comes_back(tmp_path: Path) -> None:
     async with running(tmp_path) as (machine, loop):
-        recording = analyse(await step_samples(loop, 6.0, 1.0), 0.5, {})
+        recording = analyse(await step_samples(loop, machine.rotation, 6.0, 1.0), 0.5, {})
         assert [step.to_deg for step in recording.steps] == pytest.approx([6.0 * share for share in SHARES[1:]])
         assert all(step.settling_s is not None and abs(step.error_deg) < 0.2 for step in recording.steps)
         assert recording.backlash_from == "encoder"

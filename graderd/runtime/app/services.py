@@ -18,6 +18,7 @@ from pydantic import Field
 from graderd.config import Config
 from graderd.hal.device import DeviceService
 from graderd.hal.errors import CommandRangeError, DeviceMissingError, DeviceRefusedError
+from graderd.hal.rotator import Rotator
 from graderd.hal.settings import Finite, Positive, Settings
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
@@ -110,7 +111,7 @@ def build_services(
     frames = CalibrationFrames(config.state.directory)
 
     async def step_response(wanted: StepArguments) -> dict[str, Any]:
-        return await _step_response(config, loop, wanted)
+        return await _step_response(config, devices.rotation, loop, wanted)
 
     async def calibrate(wanted: CalibrateArguments) -> dict[str, Any]:
         return await _collect_frames(config, loop, eyes, frames, wanted)
@@ -139,9 +140,9 @@ def build_services(
     }
 
 
-async def _step_response(config: Config, loop: ControlLoop, wanted: StepArguments) -> dict[str, Any]:
+async def _step_response(config: Config, rotator: Rotator, loop: ControlLoop, wanted: StepArguments) -> dict[str, Any]:
     """Steps, analysed, with the settings in force and a page to keep."""
-    samples = await step_samples(loop, wanted.step_deg, wanted.dwell_s)
+    samples = await step_samples(loop, rotator, wanted.step_deg, wanted.dwell_s)
     settings = {name: str(value) for name, value in config.rotation.model_dump().items()}
     settings["simulated"] = "yes" if config.simulated else "no"
     recording = analyse(samples, config.rotation.tolerance_deg, settings)
