@@ -29,6 +29,19 @@ POLL_S = 0.05
 STALLED_S = 60.0
 """What is waited for may take as long as it gets on. A machine busy with other things is slow: it is not broken."""
 DECISION_FRAMES_N = 300
+CONFIG = """\
+[api]
+socket = "{socket}"
+[camera]
+stale_s = 1.5
+restart_s = 15.0
+[perception.decision]
+max_frame_age_s = 1.0
+[rule]
+vote_max_age_s = 5.0
+"""
+"""Beside ten others a picture is half a second in the making, and comes twice a second instead of fifteen times. The
+machine stands while it looks: an older picture shows it the same soil."""
 ATTEMPTS_N = 5
 RECOVERY_S = 5.0
 """A pass that the machine broke off is driven anew, so often, once the machine has been without faults within this
@@ -121,7 +134,7 @@ async def _machine(directory: Path, show: Show) -> AsyncIterator[AsyncClient]:
     rig = RigProcess(directory)
     socket_path = directory / "graderd.sock"
     config_path = directory / "demo.toml"
-    config_path.write_text(f'[api]\nsocket = "{socket_path}"\n', encoding="utf-8")
+    config_path.write_text(CONFIG.format(socket=socket_path), encoding="utf-8")
     show.event("starting", what="rig")
     await rig.start()
     log_path = directory / "daemon.log"

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
+import tomllib
 from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
 
-from graderd.config import Config
+from graderd.config import Config, parse
 from graderd.drivers.j1939.link import CanLink
 from graderd.drivers.j1939.transport import Message
 from graderd.drivers.j1939.vehicle import J1939Vehicle, wheel_speed_m_per_s
@@ -17,8 +18,9 @@ from graderd.drivers.simulated.vehicle import SimulatedVehicle
 from graderd.hal.clock import SystemClock
 from graderd.hal.settings import CanSettings, VehicleSettings
 from graderd.hal.vehicle import VehicleTelemetry
-from graderd.runtime.app.sim import attach
+from graderd.runtime.app.sim import RIG_FRAME_AGE_S, attach
 from graderd.simulator.control_client import RigControl
+from graderd.simulator.demo import CONFIG as DEMONSTRATION
 from graderd.simulator.process import Rig
 from harness.electrak_sim import until
 from tests.rig_process import rig_here
@@ -192,3 +194,12 @@ def test_a_daemon_with_a_rig_hears_the_rigs_wheels_unless_told_otherwise(tmp_pat
     assert attach(Config(), tmp_path).vehicle == VehicleSettings(source="simulated", path="k")
     on_bus = Config(vehicle=VehicleSettings(source="j1939", address_n=3))
     assert attach(on_bus, tmp_path).vehicle == on_bus.vehicle
+
+
+def test_a_rigs_picture_may_be_older_and_older_still_where_the_configuration_says_so(tmp_path: Path) -> None:
+    """Rendering takes a while; the demonstration, beside others on a busy machine, gives it a second."""
+    names = {"servo": "s", "can": {"interface": "slcan", "channel": "c"}, "camera": "p", "control": "k"}
+    (tmp_path / "rig.json").write_text(json.dumps({"pid": 1, "stop_input": "t", **names}))
+    patient = parse(tomllib.loads(DEMONSTRATION.format(socket=tmp_path / "s")))
+    for config, most_s in ((Config(), RIG_FRAME_AGE_S), (patient, 1.0)):
+        assert attach(config, tmp_path).perception.decision.max_frame_age_s == most_s

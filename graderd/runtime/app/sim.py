@@ -149,7 +149,8 @@ def attach(config: Config, directory: Path) -> Config:
         ) from None
     plays_files = config.camera.source not in ("realsense", "rig")
     camera = {} if plays_files else {"source": "rig", "path": rig["camera"], **RIG_STREAMS}
-    decision = config.perception.decision.model_copy(update={"max_frame_age_s": RIG_FRAME_AGE_S})
+    age_s = max(config.perception.decision.max_frame_age_s, RIG_FRAME_AGE_S)
+    decision = config.perception.decision.model_copy(update={"max_frame_age_s": age_s})
     changes = {
         "simulated": True,
         "perception": config.perception.model_copy(update={"decision": decision}),
