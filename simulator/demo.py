@@ -43,8 +43,8 @@ vote_max_age_s = 5.0
 """Beside ten others a picture is half a second in the making, and comes twice a second instead of fifteen times. The
 machine stands while it looks: an older picture shows it the same soil."""
 ATTEMPTS_N = 5
-RECOVERY_S = 5.0
-"""A pass that the machine broke off is driven anew, so often, once the machine has been without faults within this
+RECOVERY_S = 30.0
+"""A pass that the machine broke off is driven anew, so often, once the machine could be armed again within this
 time. A busy machine starves its own servo's watchdog or its camera; what is broken stays broken."""
 SETTLED_DEG = 0.5
 SETTLED_FOR_S = 0.5
@@ -244,10 +244,11 @@ class _Demo:
                 attempt_n += 1
 
     async def _stepped_back(self) -> bool:
-        """Whether it is disarmed, or manual, without a stop, and free of faults within ``RECOVERY_S``."""
+        """Whether it is disarmed, or manual, without a stop, and could be armed again within ``RECOVERY_S``."""
         deadline_s = time.monotonic() + RECOVERY_S
+        await self._rig.request("state")  # without a rig nothing comes back
         while (status := await self.status()).mode in ("disarmed", "manual"):
-            if not any(fault.present for fault in status.faults):
+            if all(need.met for need in status.readiness if need.mandatory):
                 return True
             if time.monotonic() > deadline_s:
                 break
