@@ -381,6 +381,7 @@ def run(seed: int, ticks_n: int, monitor: Monitor) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(120.0 + 0.01 * TICKS_N)
 def test_nothing_moves_that_must_not() -> None:
     moved, decided_n = dict.fromkeys(AXES, 0), 0
     for seed in range(max(1, TICKS_N // RUN_N)):
