@@ -64,8 +64,9 @@ does not answer in so long, the interface is asked."""
 TIMEOUT_S: Final = 5.0
 SERVICE_TIMEOUT_S: Final = 120.0
 LEASE_HZ: Final = 10.0
-RENEWAL: Final = '{"command": "renew"}'
 """How often a lease is renewed, and how often its holder sees a status: three times within the 0.3 s that it lasts."""
+RENEWAL: Final = '{"command": "renew"}'
+"""What a jog's lease is renewed with; a maneuver takes any message for it."""
 BUSY_RETRY_S: Final = 3.0
 RETRY_PAUSE_S: Final = 0.02
 POLL_S: Final = 0.05
