@@ -24,7 +24,7 @@ SOAK_S ?= 900
 TESTS  := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX=$(abspath $(VENV))/byte-code $(BIN)/python -m pytest -p tests.run_times
 BESIDE := -n 2 --dist loadgroup
 # A third of the tests' time is waiting, for virtual devices that move in real time.
-WAITING := -n 4 --dist loadgroup
+WAITING := -n 3 --dist loadgroup
 
 .PHONY: help run test unit quick passes peers test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean mutants mutants-wide claims core-coverage
 
@@ -74,8 +74,7 @@ run: $(STAMP) ## drive the demonstration on the simulated grader (ARGS=--json fo
 
 test: $(STAMP) ## run the tests; run times by file at the end of each part
 	@$(TESTS) $(WAITING) -m "not whole_machine and not serial_only" $(PYTEST_ARGS)
-	@$(TESTS) $(BESIDE) -m whole_machine $(PYTEST_ARGS)
-	@$(TESTS) -m serial_only $(PYTEST_ARGS)
+	@$(TESTS) -m "whole_machine or serial_only" $(PYTEST_ARGS)
 
 unit: $(STAMP) ## run the pure tests: no process, no socket, seconds
 	@$(TESTS) $(BESIDE) -m "not live and not slow" $(PYTEST_ARGS) tests/unit

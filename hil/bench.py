@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 import time
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Final
 
 from graderd.client import Client, NoDaemonError, RefusedError
-from hil.service import SOCKET, Status, WaitError, brief, faults, wait_for
+from hil.service import SOCKET, Status, WaitError, brief, faults, measured, wait_for
 
 RESULTS: Final = Path(__file__).resolve().parent.parent / "var" / "bench"
 RENEW_S: Final = 0.1
@@ -107,10 +108,8 @@ class Bench:
         tolerance = SETTLED_DEG if unit == "deg" else SETTLED_MM
         watched = {"rotate": "rotation", "lift": "lift_left", "tilt": "tilt"}[axis]
         start = self._measured(watched)
-        trace = self._jog(
-            axis, value, lambda status: abs(status["axes"][watched]["measured"] - start - value) <= tolerance
-        )
-        moved = [(t, y - start) for t, y in ((t, s["axes"][watched]["measured"]) for t, s in trace)]
+        trace = self._jog(axis, value, lambda status: abs(measured(status, watched) - start - value) <= tolerance)
+        moved = [(t, y - start) for t, y in ((t, measured(s, watched)) for t, s in trace) if not math.isnan(y)]
         sign = 1.0 if value > 0 else -1.0
         began_s = next((t for t, y in moved if abs(y) > 0.1 * abs(value)), float("nan"))
         peak = max(y * sign for _, y in moved)
@@ -131,7 +130,7 @@ class Bench:
             return
         self._arm()
         start = self._measured("rotation")
-        self._jog("rotate", 10.0, lambda status: abs(status["axes"]["rotation"]["measured"] - start) > 3.0)
+        self._jog("rotate", 10.0, lambda status: abs(measured(status, "rotation") - start) > 3.0)
         at, began_s = self._measured("rotation"), time.monotonic()
         self._client.stop()
         wait_for("a stand", lambda: not self._status()["axes"]["rotation"]["moving"], 3.0, 0.02)
@@ -155,7 +154,7 @@ class Bench:
         self._client.command("manual")
 
     def _measured(self, axis: str) -> float:
-        return float(self._status()["axes"][axis]["measured"])
+        return measured(self._status(), axis)
 
     def _jog(self, axis: str, value: float, done: Callable[[Status], bool]) -> list[tuple[float, Status]]:
         """Jog while renewing the lease until ``done`` or time-out; what was seen on the way."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import socket
 import subprocess
 import time
@@ -31,6 +32,13 @@ Status = dict[str, Any]
 
 class WaitError(AssertionError):
     """Something did not come true in time; the text says what was seen last."""
+
+
+def measured(status: Status, axis: str) -> float:
+    """Where an axis is measured, in its unit; NaN, which is near to nothing and far from nothing, where that is not
+    known at this moment."""
+    found = status["axes"][axis]["measured"]
+    return math.nan if found is None else float(found)
 
 
 def wait_for(what: str, check: Callable[[], Any], timeout_s: float, every_s: float = 0.05) -> Any:
@@ -335,7 +343,7 @@ def new_pass(grader: Grader, rig: Rig, zone: str, seed: int) -> None:
     rig.ask("scene", zone="none")
     rig.ask("reset_vehicle")
     grader.wait("pictures", lambda s: s["soil"]["age_s"] is not None)
-    grader.jog("rotate", 0.0, lambda s: abs(s["axes"]["rotation"]["measured"]) <= 0.5)
+    grader.jog("rotate", 0.0, lambda s: abs(measured(s, "rotation")) <= 0.5)
     rig.ask("scene", zone=zone, seed=seed)
     grader.client.command("auto")
 
@@ -347,6 +355,6 @@ def turn(grader: Grader, rig: Rig) -> None:
     def turning(status: Status) -> bool:
         rotation = status["axes"]["rotation"]
         # Well away from 0, where the way there may not quite have ended.
-        return (rotation["velocity_per_s"] or 0.0) > 2.0 and rotation["measured"] > 5.0
+        return (rotation["velocity_per_s"] or 0.0) > 2.0 and measured(status, "rotation") > 5.0
 
     grader.wait("turning", turning, 40.0)

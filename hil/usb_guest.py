@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from graderd.client import ClientError, Lease
 from hil.bus import details, interface_exists
-from hil.service import PYTHON, Grader, Unit, brief, faults, run, wait_for
+from hil.service import PYTHON, Grader, Unit, brief, faults, measured, run, wait_for
 
 OUT: Final = Path(os.environ.get("HIL_OUT", "/run/hil-out"))
 SERVO: Final = Path("/dev/graderd/servo")
@@ -136,7 +136,7 @@ def ready(grader: Grader) -> None:
 def turning(grader: Grader, goal_deg: float) -> Iterator[float]:
     """Arm and jog towards the goal, with the key held down while the block lasts; yields an angle under way."""
     grader.arm("manual")
-    start = grader.status()["axes"]["rotation"]["measured"]
+    start = measured(grader.status(), "rotation")
     let_go = threading.Event()
 
     def hold_down(lease: Lease) -> None:
@@ -149,8 +149,8 @@ def turning(grader: Grader, goal_deg: float) -> Iterator[float]:
         key = threading.Thread(target=hold_down, args=(lease,), name="key")
         key.start()
         try:
-            state = grader.wait("turning", lambda s: abs(s["axes"]["rotation"]["measured"] - start) > 1.0, 30.0)
-            yield float(state["axes"]["rotation"]["measured"])
+            state = grader.wait("turning", lambda s: abs(measured(s, "rotation") - start) > 1.0, 30.0)
+            yield measured(state, "rotation")
         finally:
             let_go.set()
             key.join()
@@ -213,9 +213,9 @@ def main() -> int:
         )
         found["latency_ms"] = latency_ms()
         assert found["latency_ms"] == 1, found
-        before = grader.status()["axes"]["rotation"]["measured"]
+        before = measured(grader.status(), "rotation")
         time.sleep(3.0)
-        after = grader.status()["axes"]["rotation"]["measured"]
+        after = measured(grader.status(), "rotation")
         assert abs(after - before) < 0.2, "it stands"
         assert before < 25.0, "it stopped on the way, for the servo's own watchdog ended the motion"
         found["stands_at_deg"] = after

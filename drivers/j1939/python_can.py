@@ -30,5 +30,6 @@ __all__ = ["MESSAGE_READERS", "BinaryIOMessageReader", "SocketcanBus", "can", "l
 
 def load_mf4() -> None:
     """Let python-can find asammdf: call it before an MF4 log is opened. Without the extra ``mf4`` nothing changes."""
-    if _LOG_LIBRARY not in sys.modules:
-        importlib.reload(sys.modules["can.io.mf4"])
+    reader = sys.modules["can.io.mf4"]
+    if getattr(reader, _LOG_LIBRARY) is None:
+        importlib.reload(reader)

@@ -23,7 +23,7 @@ LATCHED_S = 1.3
 EVERYTHING = tuple(MOVING)
 OUTSIDE_DEG = 0.5
 WAY = {
-    "rotation": ("blade_deg", 15.0),
+    "rotation": ("blade_deg", 10.0),
     "lift_left": ("lift_left_mm", 40.0),
     "lift_right": ("lift_right_mm", 40.0),
     "tilt": ("tilt_mm", 25.0),

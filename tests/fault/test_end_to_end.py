@@ -21,7 +21,7 @@ from graderd.client import RefusedError
 from graderd.simulator.control_client import RigControl
 from tests.machine import READY_S, machine, start_rig
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.whole_machine, pytest.mark.timeout(240)]
 
 
 @pytest.fixture
@@ -48,7 +48,6 @@ async def test_the_demonstration_turns_the_blade_by_what_the_camera_sees() -> No
         assert measured_deg == pytest.approx(requested_deg, abs=0.5)
 
 
-@pytest.mark.whole_machine
 async def test_two_demonstrations_beside_each_other_pass(short_path: Path) -> None:
     """Two checkouts, or two users: nothing of one is the other's, whatever the place for run-time files."""
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(short_path)}
@@ -65,7 +64,6 @@ async def test_two_demonstrations_beside_each_other_pass(short_path: Path) -> No
     assert list(short_path.iterdir()) == []
 
 
-@pytest.mark.whole_machine
 async def test_a_demonstration_that_fails_says_why_in_its_last_event(short_path: Path) -> None:
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "graderd", "demo", "--json"),
@@ -87,7 +85,6 @@ async def test_a_demonstration_that_fails_says_why_in_its_last_event(short_path:
     assert list(short_path.iterdir()) == []
 
 
-@pytest.mark.whole_machine
 async def test_a_pass_that_a_busy_machine_broke_off_is_driven_anew() -> None:
     """A daemon without a processor: the servo's own watchdog ends motion, and the daemon disarms when it sees why."""
     demo = await asyncio.create_subprocess_exec(
@@ -119,7 +116,6 @@ async def test_a_pass_that_a_busy_machine_broke_off_is_driven_anew() -> None:
         await demo.communicate()
 
 
-@pytest.mark.whole_machine
 async def test_a_demonstration_ended_from_outside_says_so_and_leaves_nothing(short_path: Path) -> None:
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "graderd", "demo", "--json"),
@@ -136,7 +132,6 @@ async def test_a_demonstration_ended_from_outside_says_so_and_leaves_nothing(sho
     assert list(short_path.iterdir()) == []
 
 
-@pytest.mark.whole_machine
 async def test_the_servo_stops_by_its_own_watchdog_when_the_daemon_is_killed(tmp_path: Path) -> None:
     async with machine(tmp_path) as whole:
         await whole.turn()
@@ -160,7 +155,6 @@ async def test_the_servo_stops_by_its_own_watchdog_when_the_daemon_is_killed(tmp
         assert stopped_s < 2.0
 
 
-@pytest.mark.whole_machine
 async def test_a_dead_rig_is_named_held_and_back_in_standby_when_it_returns(tmp_path: Path) -> None:
     async with machine(tmp_path) as whole:
         await whole.turn()
@@ -180,7 +174,6 @@ async def test_a_dead_rig_is_named_held_and_back_in_standby_when_it_returns(tmp_
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-@pytest.mark.whole_machine
 async def test_a_signal_in_mid_turn_ends_everything_within_two_seconds(tmp_path: Path, number: signal.Signals) -> None:
     async with machine(tmp_path) as whole:
         await whole.turn()
@@ -195,7 +188,6 @@ async def test_a_signal_in_mid_turn_ends_everything_within_two_seconds(tmp_path:
         assert not (tmp_path / "graderd.sock").exists()
 
 
-@pytest.mark.whole_machine
 async def test_a_second_daemon_on_the_same_socket_says_so_and_disturbs_nothing(tmp_path: Path) -> None:
     async with machine(tmp_path) as whole:
         await whole.until(lambda s: all(a.lifecycle == "standby" for a in s.axes.values()))

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from hil.bus import RawBus
-from hil.service import Grader, Rig, faults, new_pass, turn
+from hil.service import Grader, Rig, faults, measured, new_pass, turn
 
 AFTER_S = 30.0
 
@@ -22,7 +22,7 @@ def test_soil_turns_the_blade(ready: Grader, rig: Rig) -> None:
         ready.wait(
             f"soil {zone}: blade at {angle_deg:+g} deg",
             lambda s, goal=angle_deg: (  # type: ignore[misc]  # a lambda's default has no annotation
-                abs(s["axes"]["rotation"]["measured"] - goal) <= 0.5
+                abs(measured(s, "rotation") - goal) <= 0.5
                 and s["axes"]["rotation"]["requested"] == goal
                 and not s["axes"]["rotation"]["moving"]
             ),

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from hil.bus import RawBus, daemons_claim
-from hil.service import SOCKET, Grader, Rig, turn, wait_for
+from hil.service import SOCKET, Grader, Rig, measured, turn, wait_for
 from tests.hil.conftest import bus_users
 
 # Until the servo's own watchdog has ended the motion, at the speed the tests turn with.
@@ -125,7 +125,7 @@ def test_the_clock_may_jump(ready: Grader, rig: Rig) -> None:
             assert state["mode"] == "auto"
     finally:
         time.clock_settime(time.CLOCK_REALTIME, real_s + time.monotonic() - mono_s)
-    state = ready.wait("it got there", lambda s: abs(s["axes"]["rotation"]["measured"] - 45.0) <= 0.5, 20.0)
+    state = ready.wait("it got there", lambda s: abs(measured(s, "rotation") - 45.0) <= 0.5, 20.0)
     assert state["mode"] == "auto"
     assert ready.unit.pid == pid
     assert state["tick"]["overruns_n"] - overruns <= 3

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from hil import bus
-from hil.service import Grader, Rig, Status, Unit, brief, faults, new_pass
+from hil.service import Grader, Rig, Status, Unit, brief, faults, measured, new_pass
 
 SOAK_S = float(os.environ.get("GRADERD_SOAK_S", "120"))
 SEED = int(os.environ.get("GRADERD_HIL_SEED", "0"))
@@ -36,7 +36,7 @@ class Soak:
         """Soil somewhere; where the machine is in automatic it turns there."""
         zone = self.random.choice(sorted(ANGLES))
         new_pass(self.grader, self.rig, zone, self.random.randrange(1000))
-        self.grader.wait(f"soil {zone}", lambda s: abs(s["axes"]["rotation"]["measured"] - ANGLES[zone]) <= 0.5, 30.0)
+        self.grader.wait(f"soil {zone}", lambda s: abs(measured(s, "rotation") - ANGLES[zone]) <= 0.5, 30.0)
 
     def rig_fault(self, kind: str, name: str, seconds: float, **params: object) -> None:
         """One fault of a simulated device for a while."""

@@ -24,7 +24,7 @@ from graderd.drivers.j1939.can_logs import candump_line, parse_candump_line, rea
 from graderd.drivers.j1939.can_port import BusPort, open_port
 from graderd.drivers.j1939.dm1 import dtc_of, encode
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id
-from graderd.drivers.j1939.python_can import SocketcanBus, can
+from graderd.drivers.j1939.python_can import SocketcanBus, can, load_mf4
 from graderd.drivers.j1939.transport import Transport
 from graderd.hal.errors import ProtocolError
 from graderd.hal.settings import CanSettings
@@ -86,6 +86,7 @@ def log(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     elif request.param == "txt":
         path.write_text(candump_columns())
     else:
+        load_mf4()
         with can.Logger(path) as writer:
             for t_s, frame in FRAMES:
                 writer.on_message_received(
