@@ -98,7 +98,7 @@ def test_a_layer_of_soil_is_not_taken_for_the_ground(tilt_deg: float) -> None:
     turn = np.array([[math.cos(angle), 0, -math.sin(angle)], [0, 1, 0], [math.sin(angle), 0, math.cos(angle)]])
     plane = find_plane((layer + np.array((0.0, 0.0, -1400.0))) @ turn.T, UP)
     assert plane.offset_mm == pytest.approx(1400.0, abs=3.0)
-    assert math.degrees(math.acos(float(plane.normal @ turn @ UP))) < 0.2
+    assert np.linalg.norm(np.cross(plane.normal, turn @ UP)) < math.sin(math.radians(0.2))
 
 
 def test_points_far_off_do_no_harm() -> None:
