@@ -243,7 +243,7 @@ def main(argv: list[str] | None = None) -> int:
         if not is_file and path.suffix and not path.exists():
             raise ProtocolError(str(path), "no such file")
         if arguments.source == "-":
-            text = open(sys.stdin.fileno(), encoding="utf-8", errors="replace", closefd=False)  # noqa: SIM115
+            text = open(sys.stdin.fileno(), encoding="utf-8", errors="replace", closefd=False)  # noqa: SIM115  (not ours to close)
             frames = read_candump(text, "standard input")
         else:
             frames = read_file(path) if is_file else read_live(arguments.source)

@@ -64,7 +64,7 @@ def find(folder: Path, pattern: str, where: str) -> list[Path]:
             (Path(given.anchor), str(given.relative_to(given.anchor))) if given.is_absolute() else (folder, pattern)
         )
         found = [path for path in base.glob(name) if path.is_file()]
-    except (ValueError, NotImplementedError, OSError) as error:
+    except (ValueError, NotImplementedError, OSError) as error:  # the second is pathlib's word on an absolute pattern
         raise ProtocolError(where, f"{pattern!r} is no name or pattern of files ({error})") from None
     if not found:
         raise DeviceMissingError(
