@@ -19,9 +19,39 @@ MAX_GROUND_POINTS_N = 700
 EDGE_POINTS_N = 48
 ENDS_BANDS_N = 10
 TOP_BANDS_N = 16
+"""Enough for a fit to 1 mm under the noise of one frame; more only cost time."""
+LEAST_BAND_POINTS_N = 40
+"""A band with fewer points says nothing of where the face ends in it."""
 NEARBY_M = 0.2
+"""What lies this near the face is it or something before it: the measure of how much of it agrees."""
+FOOT_M = 0.03
+"""Lowest part of the face left out: what lies at its foot, and the rounding of depth over the step to the ground."""
+END_M, TOP_M = 0.02, 0.015
+"""Margins at the ends and the upper edge, left out of the face: pixels there are half blade, half background."""
+CORNER_M = 0.03
+"""The upper edge is looked for this far from the corners, which are rounded in depth."""
+CLEAR_ASIDE_M, CLEAR_AHEAD_M, CLEAR_BEHIND_M = 0.08, 0.12, 0.25
+"""Ground is looked for this far from the ends, the edge and the moldboard's back, where none of their points fall."""
+GROUND_NEAR_M = 1.3
+"""And not farther from the blade's middle than this: the noise of depth grows with the square of the distance."""
+USUAL_PIXEL_M = 0.002
+"""What a pixel covers at the blade where no point of the face tells (848 pixels across, 1.2 m away)."""
+TOPMOST_ROW = 0.5
+"""Of the topmost row's points this share may lie above what is taken for the edge: noise has lifted those."""
 MIN_EDGE_GRAY = 6.0
 """An edge weaker than this (grey levels over two pixels) is no edge."""
+EDGE_SMOOTHED_PX = 1.2
+"""Sigma of the smoothing before edges are looked for: the sensor's noise falls below ``MIN_EDGE_GRAY``."""
+EDGE_SHARES = (0.04, 0.96)
+"""The upper edge without its corners, where two edges meet."""
+END_SHARES = (0.35, 0.95)
+"""The ends without corner and foot: soil and shade hide the foot."""
+TANGENT_SHARE = 0.01
+"""Step along an edge by which its direction in the picture is found."""
+EDGE_REACH_PX = (4, 60)
+"""An edge is looked for at least and at most so far on both sides of where it should be."""
+FORESHORTENED = 0.7
+"""A band at the blade, seen from above at about 45 degrees, spans this much less of the picture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,15 +116,15 @@ def collect_depth(
     face = _off_face(s, d, raw_z, blade, stance)
     z = raw_z - _edge_m(s, blade, stance)  # above the cutting edge
     on_face = np.abs(face) < band_m
-    before = (np.abs(s) < half - 0.02) & (z > 0.03) & (z < top - 0.015)
+    before = (np.abs(s) < half - END_M) & (z > FOOT_M) & (z < top - TOP_M)
     body = on_face & before
     nearby = int(np.count_nonzero(before & (np.abs(face) < NEARBY_M)))
     agreement = np.count_nonzero(body) / nearby if nearby else 0.0
-    clear = (np.abs(s) > half + 0.08) | (d > 0.12) | (d < -0.25)
-    ground = (np.abs(raw_z) < band_m) & clear & (np.hypot(s, d) < 1.3)
+    clear = (np.abs(s) > half + CLEAR_ASIDE_M) | (d > CLEAR_AHEAD_M) | (d < -CLEAR_BEHIND_M)
+    ground = (np.abs(raw_z) < band_m) & clear & (np.hypot(s, d) < GROUND_NEAR_M)
     wide = on_face & (np.abs(s) < half + band_m)
     # One pixel covers this much of the blade: an extreme point lies half of it inside the true end.
-    pixel_m = float(np.median(z_optical[body])) / lens.fx if body.any() else 0.002
+    pixel_m = float(np.median(z_optical[body])) / lens.fx if body.any() else USUAL_PIXEL_M
     left, right = _ends(points, s, z, wide, blade, 0.5 * pixel_m, view, angle_deg)
     return DepthEvidence(
         float(agreement),
@@ -102,7 +132,7 @@ def collect_depth(
         _thinned(points[ground], MAX_GROUND_POINTS_N),
         left,
         right,
-        _top(points, s, z, wide & (np.abs(s) < half - 0.02) & (z < top + band_m), blade, 0.5 * pixel_m, view),
+        _top(points, s, z, wide & (np.abs(s) < half - END_M) & (z < top + band_m), blade, 0.5 * pixel_m, view),
     )
 
 
@@ -116,14 +146,14 @@ def _ends(
     grow_m: float, view: View, angle_deg: float,
 ) -> tuple[F64, F64]:  # fmt: skip
     """The outermost face points on both sides, per band of height; each moved outwards by half a pixel."""
-    lows = np.linspace(0.03, blade.height_m - 0.02, ENDS_BANDS_N + 1)
+    lows = np.linspace(FOOT_M, blade.height_m - END_M, ENDS_BANDS_N + 1)
     along = blade_points_m(blade, angle_deg, np.array([1.0]), np.array([0.0]), np.array([0.0]))[0]
     along -= blade_points_m(blade, angle_deg, np.array([0.0]), np.array([0.0]), np.array([0.0]))[0]
     outwards = along @ view.rotation * grow_m
     left, right = [], []
     for low, high in pairwise(lows):
         inside = np.flatnonzero(wide & (z >= low) & (z < high))
-        if inside.size < 40:
+        if inside.size < LEAST_BAND_POINTS_N:
             continue
         order = inside[np.argsort(s[inside])]
         right.append(points[order[2]] - outwards)  # the third: a flying pixel or two do no harm
@@ -136,16 +166,16 @@ def _top(
     grow_m: float, view: View,
 ) -> F64:  # fmt: skip
     """The highest face points, per band along the blade."""
-    half = blade.length_m / 2 - 0.03
+    half = blade.length_m / 2 - CORNER_M
     lows = np.linspace(-half, half, TOP_BANDS_N + 1)
     up = np.array([0.0, 0.0, grow_m]) @ view.rotation
     found = []
     for low, high in pairwise(lows):
         inside = np.flatnonzero(near & (s >= low) & (s < high))
-        if inside.size < 40:
+        if inside.size < LEAST_BAND_POINTS_N:
             continue
-        # Half of the topmost row of pixels: the very highest are those that noise has lifted.
-        rank = max(3, round(0.25 * (high - low) / grow_m))
+        row_n = (high - low) / (2 * grow_m)
+        rank = max(3, round(TOPMOST_ROW * row_n))
         order = inside[np.argsort(z[inside])]
         found.append(points[order[-min(rank, inside.size)]] + up)
     return np.reshape(found, (-1, 3))
@@ -184,18 +214,18 @@ def _outline_m(
 
 def collect_color(color_bgr: U8, view: View, blade: BladeGeometry, stance: Stance, band_m: float) -> ColorEvidence:
     """Find the outline's edges in one colour picture, within ``band_m`` (at the blade) of where it should be."""
-    gray = cv2.GaussianBlur(cv2.cvtColor(color_bgr, cv2.COLOR_BGR2GRAY), (0, 0), 1.2).astype(np.float32)
-    share = np.linspace(0.04, 0.96, EDGE_POINTS_N)
+    gray = cv2.GaussianBlur(cv2.cvtColor(color_bgr, cv2.COLOR_BGR2GRAY), (0, 0), EDGE_SMOOTHED_PX).astype(np.float32)
+    share = np.linspace(*EDGE_SHARES, EDGE_POINTS_N)
     side = np.repeat(np.array([TOP, LEFT_END, RIGHT_END], dtype=np.int8), EDGE_POINTS_N)
     shares = np.tile(share, 3)
-    shares[EDGE_POINTS_N:] = np.tile(np.linspace(0.35, 0.95, EDGE_POINTS_N), 2)  # soil and shade hide the ends' feet
+    shares[EDGE_POINTS_N:] = np.tile(np.linspace(*END_SHARES, EDGE_POINTS_N), 2)
     at = view.project(_outline_m(blade, stance, side, shares))
-    nearby = view.project(_outline_m(blade, stance, side, shares + 0.01))
+    nearby = view.project(_outline_m(blade, stance, side, shares + TANGENT_SHARE))
     tangent = nearby - at
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
     normal = np.column_stack((-tangent[:, 1], tangent[:, 0]))
     distance = float(np.linalg.norm(view.position_m[:2])) or 1.0
-    reach = int(np.clip(band_m * view.lens.fx / distance * 0.7, 4, 60))
+    reach = int(np.clip(band_m * view.lens.fx / distance * FORESHORTENED, *EDGE_REACH_PX))
     offsets = np.arange(-reach - 1, reach + 2, dtype=np.float64)
     spots = at[:, None, :] + normal[:, None, :] * offsets[None, :, None]
     sampled = cv2.remap(gray, spots[..., 0].astype(np.float32), spots[..., 1].astype(np.float32), cv2.INTER_LINEAR)

@@ -27,12 +27,25 @@ TILE_PX = 4
 FLAT_GRAY = 1.6
 """Standard deviation (grey levels) within a tile of the smoothed sample below which it shows nothing."""
 STILL_FLAT_PERCENT = 99.0
+"""A photograph may have its smooth sky or wall; only where hardly anything else is left is the lens covered."""
 CLIPPED_GRAY = 250
+"""Grey level from which a pixel shows no more than that it is bright: compression and noise keep some below 255."""
+GRAY_PERCENT = 255 / 100
+"""Grey levels of one per cent of full brightness."""
+DEPTH_STEP_PX = 8
+"""Every eighth pixel of every eighth row, 6,000 of them, tells the share that has depth to half a per cent."""
 LAYER_MOST_M = 0.10
 """A layer of soil before a lifted blade is hardly thicker: it would fill the quarter-scale blade to 40 %."""
+BLUR_WIDTH_PX = 1280
+"""The picture that the distances of the blur's measure are meant for; a larger one is measured as coarsely."""
 BLUR_ROWS_N = 9
+"""Rows looked at: more hardly change the answer, and each costs a walk through memory."""
 BLUR_MIN_CONTRAST = 64.0
 """Square grey levels of four summed pixels."""
+BLUR_GROWTH = 0.1
+"""Where contrast grows by less than this share from 4 to 16 pixels there is noise alone, and nothing to judge by."""
+BLUR_RANK = 0.7
+"""The sharper rows count: a picture is blurred where all of it is, and shade or an even floor has no detail."""
 
 
 class HealthMonitor:
@@ -97,7 +110,7 @@ class HealthMonitor:
     def _light(self, sample: U8) -> list[PictureFault]:
         settings = self._settings
         gray = cv2.cvtColor(sample, cv2.COLOR_BGR2GRAY)
-        mean_percent = float(gray.mean()) / 2.55
+        mean_percent = float(gray.mean()) / GRAY_PERCENT
         if mean_percent < settings.black_percent:
             return [
                 PictureFault("black", f"mean brightness {mean_percent:.1f} %, at least {settings.black_percent:g} %")
@@ -106,7 +119,6 @@ class HealthMonitor:
         if clipped > settings.blown_out_percent:
             return [PictureFault("blown_out", f"{clipped:.0f} % of the pixels are clipped")]
         flat = 100.0 * flat_share(np.asarray(gray, dtype=np.uint8))
-        # A photograph may have its smooth sky or wall; a camera that looks at the blade has not.
         if flat > (
             settings.blocked_flat_percent if self._live else max(STILL_FLAT_PERCENT, settings.blocked_flat_percent)
         ):
@@ -118,7 +130,7 @@ class HealthMonitor:
             return []
         mark = sample.tobytes()
         if frame.depth_mm is not None:
-            mark += frame.depth_mm[::16, ::16].tobytes()
+            mark += frame.depth_mm[:: SAMPLE_STEP_PX[0], :: SAMPLE_STEP_PX[1]].tobytes()
         self._same_n = self._same_n + 1 if mark == self._last_sample else 0
         self._last_sample = mark
         if self._same_n >= self._settings.frozen_frames_n:
@@ -142,7 +154,8 @@ class HealthMonitor:
     def _depth(self, frame: Frame) -> list[PictureFault]:
         if frame.depth_mm is None:
             return [PictureFault("depth_missing", "the frame has no depth picture")]
-        valid = 100.0 * float(np.count_nonzero(frame.depth_mm[::8, ::8])) / frame.depth_mm[::8, ::8].size
+        sample = frame.depth_mm[::DEPTH_STEP_PX, ::DEPTH_STEP_PX]
+        valid = 100.0 * float(np.count_nonzero(sample)) / sample.size
         if valid < self._settings.depth_valid_percent:
             return [PictureFault("depth_missing", f"only {valid:.0f} % of the picture has depth")]
         return []
@@ -216,7 +229,7 @@ def sharpness_ratio(image_bgr: U8, region: Region) -> float:
     count (their 70th percentile), because a picture is blurred where all of it is. Distances are those of a picture
     1280 across; larger ones are measured as coarsely. 1 where there is no contrast to judge by.
     """
-    unit = max(1, round(image_bgr.shape[1] / 1280))
+    unit = max(1, round(image_bgr.shape[1] / BLUR_WIDTH_PX))
     band = image_bgr[region.rows, region.columns, 1]
     step = max(4, band.shape[0] // BLUR_ROWS_N)
     usable = band.shape[0] // step * step
@@ -226,12 +239,11 @@ def sharpness_ratio(image_bgr: U8, region: Region) -> float:
     for row in range(1, 4):
         lines += band[row:usable:step]
     two, four, sixteen = (_square_difference(lines, distance * unit) for distance in (2, 4, 16))
-    # Where contrast does not grow with distance there is noise alone, and nothing to judge by.
-    textured = sixteen - four > np.maximum(BLUR_MIN_CONTRAST, 0.1 * four)
+    textured = sixteen - four > np.maximum(BLUR_MIN_CONTRAST, BLUR_GROWTH * four)
     if not textured.any():
         return 1.0
     ratios = np.sort((four - two)[textured] / (sixteen - four)[textured])
-    return float(ratios[ratios.size * 7 // 10])
+    return float(ratios[int(ratios.size * BLUR_RANK)])
 
 
 def _square_difference(lines: F32, distance: int) -> F32:
