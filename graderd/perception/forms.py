@@ -201,7 +201,8 @@ def _lower_cones(height: F64, rise_s_per_cell: float, rise_d_per_cell: float) ->
     for axis, rise_per_cell in enumerate((rise_s_per_cell, rise_d_per_cell)):
         steps = rise_per_cell * np.arange(height.shape[axis])
         steps = steps[:, None] if axis == 0 else steps[None, :]
+        back = np.s_[::-1] if axis == 0 else np.s_[:, ::-1]
         up = np.minimum.accumulate(height - steps, axis=axis) + steps
-        down = np.flip(np.minimum.accumulate(np.flip(height + steps, axis), axis=axis), axis) - steps
+        down = np.minimum.accumulate((height + steps)[back], axis=axis)[back] - steps
         height = np.minimum(up, down)
     return height
