@@ -7,7 +7,6 @@ its configuration, and only as long as the settings are those that were measured
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -16,14 +15,8 @@ import typer
 from graderd import places
 from graderd.cli.classify import summary_text
 from graderd.cli.console import CliError, ExitCode, Json, agree, example, print_json, print_text
+from graderd.core.soil import ColorMethod
 from graderd.hal.errors import DeviceError
-
-
-class ColorMethod(StrEnum):
-    """The methods that see no depth."""
-
-    PAPER = "paper"
-    FAST_COLOR = "fast_color"
 
 
 def register(group: typer.Typer) -> None:
@@ -39,7 +32,7 @@ def register(group: typer.Typer) -> None:
         source: Annotated[
             Path, typer.Option("--from", metavar="FRAME_SET", help="Frames of this site, labelled in manifest.csv.")
         ],
-        method: Annotated[ColorMethod, typer.Option(help="Which method to measure.")] = ColorMethod.FAST_COLOR,
+        method: Annotated[ColorMethod, typer.Option(help="Which method to measure.")] = "fast_color",
         config: Annotated[Path | None, typer.Option(help=f"Configuration to change. Default: {places.CONFIG}.")] = None,
         yes: Annotated[bool, typer.Option("--yes", help="Consent: write the result unasked.")] = False,
         json: Json = False,
@@ -68,7 +61,7 @@ def _color(source: Path, method: ColorMethod, config: Path | None, yes: bool, as
     cv2.setNumThreads(1)
     path = config or places.CONFIG
     settings = load_config(path, must_exist=config is not None).perception
-    settings = settings.model_copy(update={"method": method.value})
+    settings = settings.model_copy(update={"method": method})
     may_write(path)
     score = Score()
     try:

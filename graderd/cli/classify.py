@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from graderd.cli.console import CliError, ExitCode, Json, example, plain_table, print_error, print_json, print_text
-from graderd.core.soil import SoilObservation, Zone
+from graderd.core.soil import Method, Mounting, SoilObservation, Zone
 from graderd.hal.errors import DeviceError, ProtocolError
 
 if TYPE_CHECKING:
@@ -21,22 +20,6 @@ if TYPE_CHECKING:
 
 READ_TIMEOUT_S = 5.0
 JPEG_QUALITY = 90
-
-
-class MethodName(StrEnum):
-    """The classifiers."""
-
-    PAPER = "paper"
-    FAST_COLOR = "fast_color"
-    DEPTH = "depth"
-    FUSED = "fused"
-
-
-class MountingName(StrEnum):
-    """Which way the camera faces."""
-
-    FRONT = "facing_blade_from_front"
-    BEHIND = "facing_blade_from_behind"
 
 
 def register(app: typer.Typer) -> None:
@@ -53,7 +36,7 @@ def register(app: typer.Typer) -> None:
     def classify(
         source: Annotated[Path, typer.Argument(help="Picture, folder of pictures, video, recording or frame set.")],
         method: Annotated[
-            MethodName | None, typer.Option(help="Default: depth where the source has it, else fast_color.")
+            Method | None, typer.Option(help="Default: depth where the source has it, else fast_color.")
         ] = None,
         config: Annotated[
             Path | None,
@@ -64,8 +47,8 @@ def register(app: typer.Typer) -> None:
             typer.Option(min=-90, max=90, help="Blade angle. Default: the frame set's own, else 0."),
         ] = None,
         mounting: Annotated[
-            MountingName, typer.Option(help="Which way the camera faces, for pictures without a calibration.")
-        ] = MountingName.FRONT,
+            Mounting, typer.Option(help="Which way the camera faces, for pictures without a calibration.")
+        ] = "facing_blade_from_front",
         save: Annotated[Path | None, typer.Option(metavar="DIR", help="Write annotated pictures here.")] = None,
         json: Json = False,
     ) -> None:
@@ -89,10 +72,10 @@ class Run:
     def __init__(
         self,
         source: Path,
-        method: MethodName | None,
+        method: Method | None,
         config: Path | None,
         blade_angle_deg: float | None,
-        mounting: MountingName,
+        mounting: Mounting,
     ) -> None:
         # Heavy imports wait until the command really runs.
         import cv2
@@ -208,8 +191,8 @@ class Run:
         has_depth = frame.depth_mm is not None
         method = self._method
         if method is None:
-            method = MethodName.DEPTH if has_depth else MethodName.FAST_COLOR
-        if method in (MethodName.DEPTH, MethodName.FUSED) and not has_depth:
+            method = "depth" if has_depth else "fast_color"
+        if method in ("depth", "fused") and not has_depth:
             raise CliError(
                 self._camera.description,
                 f"--method {method} needs depth, and this source has none",
@@ -218,7 +201,7 @@ class Run:
             )
         settings = self._perception.model_copy(update={"method": str(method)})
         blade = self._blade or BladeGeometry()
-        return make_classifier(settings, self._calibration, blade, self._live, self._mounting.value)
+        return make_classifier(settings, self._calibration, blade, self._live, self._mounting)
 
     def _save(self, folder: Path, name: str, frame: Frame, observation: SoilObservation) -> None:
         import cv2

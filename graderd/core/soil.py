@@ -8,6 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Literal
+
+ColorMethod = Literal["paper", "fast_color"]
+"""The methods that see no depth: the study's own, and the same decision for a fraction of its time."""
+Method = Literal["paper", "fast_color", "depth", "fused"]
+"""How a picture is judged."""
+Mounting = Literal["facing_blade_from_front", "facing_blade_from_behind"]
+"""Which way the camera faces: from the front, the operator's left is on the right of the picture."""
 
 
 class Zone(StrEnum):

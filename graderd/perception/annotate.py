@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from graderd.core.blade import BladeGeometry
-from graderd.core.soil import SoilObservation, Zone
+from graderd.core.soil import Mounting, SoilObservation, Zone
 from graderd.perception.calibration import CalibrationResult
 from graderd.perception.geometry import (
     CENTER,
@@ -22,7 +22,6 @@ from graderd.perception.geometry import (
     third_outlines_px,
     top_edge_m,
 )
-from graderd.perception.settings import Mounting
 
 Bgr = tuple[int, int, int]
 COLORS: dict[int, Bgr] = {LEFT: (80, 200, 80), CENTER: (230, 170, 60), RIGHT: (60, 120, 240)}

@@ -13,7 +13,7 @@ import numpy as np
 
 from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
-from graderd.core.soil import PictureFault, SoilAhead, SoilObservation, Thirds, Zone
+from graderd.core.soil import Mounting, PictureFault, SoilAhead, SoilObservation, Thirds, Zone
 from graderd.hal.camera import Frame, Intrinsics
 from graderd.hal.settings import CameraSettings
 from graderd.perception import annotate as drawing
@@ -27,12 +27,11 @@ from graderd.perception.settings import (
     CameraCalibration,
     ColorSettings,
     DecisionSettings,
-    Mounting,
     PerceptionSettings,
 )
 
-ColorMethod = Callable[[U8, Region, ColorSettings, DecisionSettings], Verdict]
-BY_COLOR: Mapping[str, ColorMethod] = {"paper": paper_verdict, "fast_color": fast_color_verdict}
+ByColor = Callable[[U8, Region, ColorSettings, DecisionSettings], Verdict]
+BY_COLOR: Mapping[str, ByColor] = {"paper": paper_verdict, "fast_color": fast_color_verdict}
 """The methods that look at the colour picture alone, by ``perception.method``."""
 ANGLE_STEP_DEG = 0.25
 KEPT_REGIONS_N = 64

@@ -34,11 +34,11 @@ from pydantic import ValidationError
 
 from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
-from graderd.core.soil import Zone
+from graderd.core.soil import Mounting, Zone
 from graderd.hal.camera import ColorImage, DepthImage, EndOfFrames, Frame, Intrinsics, StreamPose
 from graderd.hal.errors import DeviceMissingError, LifecycleError, ProtocolError
 from graderd.hal.settings import CameraSettings
-from graderd.perception.settings import CameraCalibration, Mounting, StreamCalibration
+from graderd.perception.settings import CameraCalibration, StreamCalibration
 
 MANIFEST = "manifest.csv"
 CAMERA = "camera.json"

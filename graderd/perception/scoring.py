@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from graderd.core.soil import SoilObservation, Zone
-from graderd.perception.settings import LABELS, ColorMethodName, PerceptionSettings, SiteFigure
+from graderd.core.soil import ColorMethod, SoilObservation, Zone
+from graderd.perception.settings import LABELS, PerceptionSettings, SiteFigure
 
 PILES = (Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN)
 OPPOSITE = {Zone.LEFT: Zone.RIGHT, Zone.RIGHT: Zone.LEFT}
@@ -92,7 +92,7 @@ def site_figure(score: Score, settings: PerceptionSettings, measured_at: str) ->
     Raises:
         ValueError: the method is none that goes by colour alone.
     """
-    method: ColorMethodName
+    method: ColorMethod
     match settings.method:
         case "paper" | "fast_color" as method:
             pass

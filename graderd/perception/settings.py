@@ -7,25 +7,23 @@ from __future__ import annotations
 
 import hashlib
 import math
-from typing import Annotated, Literal
+from typing import Annotated, get_args
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from graderd.core.blade import BladeGeometry
+from graderd.core.soil import ColorMethod, Method, Mounting
 from graderd.hal.camera import Intrinsics, StreamPose
 from graderd.hal.settings import Finite, NotNegative, Positive, Settings
 
-Method = Literal["paper", "fast_color", "depth", "fused"]
-METHODS: tuple[Method, ...] = ("paper", "fast_color", "depth", "fused")
+METHODS: tuple[Method, ...] = get_args(Method)
 
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Percent = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 HueDegrees = Annotated[float, Field(ge=0, le=360, allow_inf_nan=False)]
 HueHalfDegrees = Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)]
 
-
-ColorMethodName = Literal["paper", "fast_color"]
 LABELS = ("left", "center", "right", "even", "none")
 RIGHT_LEAST_PERCENT = 98.0
 """What depth is held to as well: of a hundred answers two may be wrong."""
@@ -38,7 +36,7 @@ FRAMES_LEAST_N = 20
 class SiteFigure(Settings):
     """What a colour method was worth on labelled frames of this site, as ``graderd calibrate color`` found it."""
 
-    method: ColorMethodName
+    method: ColorMethod
     settings_mark: str = Field(description="of the colour and decision settings it was measured with")
     measured_at: str = ""
     frames_least_n: int = Field(ge=0, description="labelled frames of the bed that has fewest of them")
@@ -253,9 +251,6 @@ class PerceptionSettings(Settings):
         return f"{self.method} is not good enough on this site: {short}" if short else ""
 
 
-Mounting = Literal["facing_blade_from_front", "facing_blade_from_behind"]
-
-
 class StreamCalibration(Settings):
     """One stream's lens and its place in the vehicle frame.
 
@@ -391,13 +386,11 @@ __all__ = [
     "METHODS",
     "BladeGeometry",
     "CameraCalibration",
-    "ColorMethodName",
     "ColorSettings",
     "DecisionSettings",
     "DepthSettings",
     "HealthSettings",
     "Method",
-    "Mounting",
     "PerceptionSettings",
     "SiteFigure",
     "StreamCalibration",

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from graderd.core.soil import Mounting
 from graderd.perception import CameraCalibration, PerceptionSettings
-from graderd.perception.settings import ColorSettings, Mounting, angles_from_rotation, rotation_from_angles
+from graderd.perception.settings import ColorSettings, angles_from_rotation, rotation_from_angles
 
 
 @pytest.mark.parametrize(
