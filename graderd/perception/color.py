@@ -45,7 +45,7 @@ def largest_contour(mask: U8, tolerance_percent: float) -> U8:
 
 
 def coverage_percent(mask: U8, region: Region) -> tuple[float, float, float]:
-    """Soil on each third (right, center, left), percent of the third's own area."""
+    """Soil on each third (left, center, right), percent of the third's own area."""
     counts = [cv2.countNonZero(cv2.bitwise_and(mask, third)) for third in region.masks]
     cover = [100.0 * count / area for count, area in zip(counts, region.areas_px, strict=True)]
     return cover[0], cover[1], cover[2]

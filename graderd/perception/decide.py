@@ -13,7 +13,7 @@ NAMES = {LEFT: Zone.LEFT, CENTER: Zone.CENTER, RIGHT: Zone.RIGHT}
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A zone, how sure (0 to 1), why, and the shares of the thirds (right, center, left; sum 1, or all 0)."""
+    """A zone, how sure (0 to 1), why, and the shares of the thirds (left, center, right; sum 1, or all 0)."""
 
     zone: Zone
     confidence: float
@@ -41,7 +41,7 @@ def decide(
     settings: DecisionSettings,
     volumes_l: tuple[float, float, float] | None = None,
 ) -> Verdict:
-    """Judge three amounts of soil (right, center, left; litres or percent of the third, named by ``unit``).
+    """Judge three amounts of soil (left, center, right; litres or percent of the third, named by ``unit``).
 
     Less than ``none_below`` in all is none. A third that leads the next by ``margin_ratio`` names the zone, unless
     all three hold a fair part (even). What lies between is unknown. Confidence grows with the lead, and near
@@ -56,7 +56,7 @@ def decide(
             Zone.NONE, confidence, f"{numbers}: less than {none_below:.1f} in all", (0.0, 0.0, 0.0), volumes_l
         )
     sure = min(1.0, total / none_below - 1.0) if total < 2 * none_below else 1.0
-    order = sorted((RIGHT, CENTER, LEFT), key=lambda third: shares[third], reverse=True)
+    order = sorted((LEFT, CENTER, RIGHT), key=lambda third: shares[third], reverse=True)
     most, next_most = shares[order[0]], shares[order[1]]
     least = shares[order[2]]
     even_min, even_max = settings.even_share_min_percent / 100, settings.even_share_max_percent / 100

@@ -69,7 +69,7 @@ FACE_MARGIN_M = 0.025
 class HeightMap:
     """Soil in blade coordinates: ``height_m[i, j]`` at s cell i (right to left) and d cell j (blade to front).
 
-    ``seen`` is False where the height was filled in. Triples are per third: right, center, left. ``valid``: share of
+    ``seen`` is False where the height was filled in. Triples are per third: left, center, right. ``valid``: share of
     the pixels on it that measure it, neither without depth nor hidden by something nearer. ``volumes_l``: all soil
     before each third to the reach; ``carried_l``, ``ahead_l``: see :func:`graderd.perception.split.split_soil`.
     ``doubtful_l``, ``doubtful_ahead_l``: what of ``volumes_l`` and ``ahead_l`` lies beside something that is no soil.
@@ -368,8 +368,8 @@ class DepthJudge:
         hollow = self._finder.hollow_m2(ahead[:, 0])
         both = np.stack((ahead.sum(axis=1) * self._cell_d_m + hollow, hollow))
         thirds = np.maximum(both.reshape(2, 3, -1).sum(axis=2) * self._cell_s_m * 1000.0, 0.0).tolist()
-        (right, center, left), (behind_right, behind_center, behind_left) = thirds
-        return (right, center, left), (behind_right, behind_center, behind_left)
+        (right, center, left), (behind_right, behind_center, behind_left) = thirds  # along growing s
+        return (left, center, right), (behind_left, behind_center, behind_right)
 
 
 def _plus(one: Litres, other: Litres) -> Litres:
@@ -401,7 +401,7 @@ class Cells:
 def split_soil(
     height_m: F64, cells: Cells, angle_deg: float, blade: BladeGeometry, repose_deg: float, travel_m: float
 ) -> tuple[ThirdsL, ThirdsL]:
-    """Litres carried, and litres ahead (right, center, left each) of a map of soil heights (0 where there is none).
+    """Litres carried, and litres ahead (left, center, right each) of a map of soil heights (0 where there is none).
 
     The map's rows may go on beyond the blade's ends: with the blade turned, what its leading end will meet lies there.
     Carried: under the slope at ``repose_deg`` from the crest at the face, by the third it lies before. Ahead: what
@@ -428,8 +428,8 @@ def split_soil(
 
 
 def _third(s_m: F64, blade: BladeGeometry) -> I64:
-    """1, 2, 3 for the right, center and left third in which places lie; 0 and 4 for what lies beyond the ends."""
-    return np.clip(np.floor(s_m * (3.0 / blade.length_m) + 2.5), 0.0, 4.0).astype(np.intp)
+    """1, 2, 3 for the left, center and right third in which places lie; 0 and 4 for what lies beyond the ends."""
+    return np.clip(np.floor(s_m * (-3.0 / blade.length_m) + 2.5), 0.0, 4.0).astype(np.intp)
 
 
 def _inner(amounts: npt.NDArray[np.floating]) -> ThirdsL:

@@ -20,8 +20,8 @@ F64 = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]
 U8 = npt.NDArray[np.uint8]
 
-RIGHT, CENTER, LEFT = 0, 1, 2
-"""Index of a third, counted along growing s; left is the operator's."""
+LEFT, CENTER, RIGHT = 0, 1, 2
+"""Index of a third: the operator's left to right, as everywhere in graderd (that is along falling s)."""
 
 NOMINAL_WIDTH_PX = 848
 """Numbers in pixels of the depth picture are meant for one so wide."""
@@ -118,10 +118,10 @@ def strip_outline_m(blade: BladeGeometry, angle_deg: float, s_from_m: float, s_t
 
 
 def third_outlines_px(view: View, blade: BladeGeometry, angle_deg: float) -> tuple[F64, F64, F64]:
-    """Outlines of the three strips in the picture, ordered right, center, left (operator's)."""
+    """Outlines of the three strips in the picture: left, center, right (operator's)."""
     low, high = third_bounds_m(blade.length_m)
     half = blade.length_m / 2
-    borders = ((-half, low), (low, high), (high, half))
+    borders = ((high, half), (low, high), (-half, low))
     outlines = [view.project(strip_outline_m(blade, angle_deg, a, b)) for a, b in borders]
     return outlines[0], outlines[1], outlines[2]
 
@@ -131,7 +131,7 @@ class Region:
     """The blade's region in a picture, as masks at a reduced scale.
 
     ``rows`` and ``columns`` cut it out of the full picture (sizes are multiples of 2**``halvings``); ``masks``
-    are the thirds at the reduced scale, 255 inside, ordered right, center, left; ``areas_px`` their sizes;
+    are the thirds at the reduced scale, 255 inside: left, center, right; ``areas_px`` their sizes;
     ``blade`` is their union.
     """
 
@@ -152,7 +152,7 @@ def image_thirds(width_px: int, height_px: int, halvings: int, image_right_is_le
     """The whole picture in three upright strips, where no geometry is known; None for a picture too small."""
     border = [0.0, width_px / 3, 2 * width_px / 3, float(width_px)]
     strips = [np.array([[a, 0.0], [b, 0.0], [b, height_px], [a, height_px]]) for a, b in pairwise(border)]
-    if not image_right_is_left:
+    if image_right_is_left:
         strips.reverse()
     return region_of((strips[0], strips[1], strips[2]), width_px, height_px, halvings)
 

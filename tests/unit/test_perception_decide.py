@@ -17,8 +17,8 @@ amount = st.floats(0, 50)
 @pytest.mark.parametrize(
     ("amounts", "zone"),
     [
-        ((0.0, 1.0, 9.0), Zone.LEFT),
-        ((9.0, 1.0, 0.0), Zone.RIGHT),
+        ((9.0, 1.0, 0.0), Zone.LEFT),
+        ((0.0, 1.0, 9.0), Zone.RIGHT),
         ((2.0, 9.0, 2.0), Zone.CENTER),
         ((5.0, 5.0, 5.0), Zone.EVEN),
         ((4.0, 6.0, 5.0), Zone.EVEN),
@@ -34,8 +34,8 @@ def test_zone(amounts: tuple[float, float, float], zone: Zone) -> None:
 
 
 @given(amount, amount, amount)
-def test_never_a_guess(right: float, center: float, left: float) -> None:
-    verdict = decide((right, center, left), 1.0, "l", SETTINGS)
+def test_never_a_guess(left: float, center: float, right: float) -> None:
+    verdict = decide((left, center, right), 1.0, "l", SETTINGS)
     assert 0.0 <= verdict.confidence <= 1.0
     if verdict.zone is Zone.NONE:
         assert right + center + left < 1.0

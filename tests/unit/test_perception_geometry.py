@@ -54,7 +54,7 @@ def test_a_point_behind_the_camera_is_nowhere() -> None:
 
 @given(angle=st.floats(-60, 60))
 def test_left_is_the_operators_left(angle: float) -> None:
-    right, center, left = third_outlines_px(COLOR, BladeGeometry(), angle)
+    left, center, right = third_outlines_px(COLOR, BladeGeometry(), angle)
     assert right[:, 0].mean() < center[:, 0].mean() < left[:, 0].mean()  # the camera faces the blade
 
 
