@@ -188,8 +188,9 @@ class Client:
     """A client that waits for its answers.
 
     Args:
-        address: path of the unix socket, or ``http://HOST:PORT``; None: :func:`default_socket`.
-        token: the daemon's token, on TCP.
+        address: path of the unix socket, or ``http://HOST:PORT`` (``https://`` by the system's certificate
+            authorities, or those of ``$SSL_CERT_FILE``); None: :func:`default_socket`.
+        token: one that ``graderd token create`` made, on TCP.
         name: who asks, for the daemon's records; None: the user.
         timeout_s: how long to wait for an answer.
 
@@ -714,18 +715,20 @@ class _Address:
     host: str
     port_n: int
     token: str
+    tls: bool = False
 
     @classmethod
     def of(cls, address: Path | str | None, token: str) -> _Address:
         if isinstance(address, str) and "://" in address:
             parts = urlsplit(address)
-            if parts.scheme != "http" or not parts.hostname or parts.path.strip("/"):
-                raise ValueError(f"{address}: the daemon speaks http://HOST:PORT; for TLS put a tunnel before it")
-            return cls(None, parts.hostname, parts.port or 80, token)
+            if parts.scheme not in ("http", "https") or not parts.hostname or parts.path.strip("/"):
+                raise ValueError(f"{address}: the daemon speaks http://HOST:PORT, and with a certificate https://")
+            tls = parts.scheme == "https"
+            return cls(None, parts.hostname, parts.port or (443 if tls else 80), token, tls)
         return cls(default_socket() if address is None else Path(address), "localhost", 80, token)
 
     def __str__(self) -> str:
-        return f"http://{self.netloc}" if self.path is None else str(self.path)
+        return f"http{'s' * self.tls}://{self.netloc}" if self.path is None else str(self.path)
 
     @property
     def netloc(self) -> str:
@@ -738,14 +741,15 @@ class _Address:
         return token | ({"Content-Type": "application/json"} if with_body else {})
 
     def websocket_uri(self, path: str, query: Mapping[str, str | float]) -> str:
-        return f"ws://{self.netloc}{path}{'?' if query else ''}{urlencode(query)}"
+        return f"ws{'s' * self.tls}://{self.netloc}{path}{'?' if query else ''}{urlencode(query)}"
 
     def http_connection(self, timeout_s: float, stop_lane: bool = False) -> http.client.HTTPConnection:
         """``stop_lane``: where stop alone is served, and nobody else waits; an older daemon has none."""
         if self.path is None:
+            connection = http.client.HTTPSConnection if self.tls else http.client.HTTPConnection
             if stop_lane and 0 < self.port_n < 65535:
-                return http.client.HTTPConnection(self.host, self.port_n + 1, timeout=min(timeout_s, STOP_LANE_S))
-            return http.client.HTTPConnection(self.host, self.port_n, timeout=timeout_s)
+                return connection(self.host, self.port_n + 1, timeout=min(timeout_s, STOP_LANE_S))
+            return connection(self.host, self.port_n, timeout=timeout_s)
         stop_socket = self.path.with_suffix(STOP_SUFFIX)
         if stop_lane and _is_socket(stop_socket):
             return _UnixConnection(stop_socket, timeout_s)

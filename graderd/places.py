@@ -8,3 +8,4 @@ from typing import Final
 CONFIG: Final = Path("/etc/graderd/graderd.toml")
 SOCKET: Final = Path("/run/graderd/graderd.sock")
 STATE: Final = Path("/var/lib/graderd")
+TOKENS: Final = STATE / "api-tokens"

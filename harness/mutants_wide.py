@@ -216,10 +216,10 @@ API: Final = (
     ),
     Mutant(
         "token-for-the-group",
-        "graderd/api/tcp_guard.py",
-        "path.stat().st_mode & 0o077",
-        "path.stat().st_mode & 0o007",
-        (TCP + "test_a_token_that_the_group_may_read_is_none",),
+        "graderd/tokens.py",
+        "st_mode & 0o077",
+        "st_mode & 0o007",
+        ("tests/unit/test_tokens.py::test_a_file_that_others_may_use_is_refused",),
         "everybody in the file's group has the token",
     ),
     Mutant(

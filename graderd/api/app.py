@@ -14,6 +14,7 @@ from graderd.api.http_routes import StatusTexts, http_routes
 from graderd.api.limiter import Closing, Limiter
 from graderd.api.port import DaemonPort
 from graderd.api.problem import Problem, ProblemError, problem_of_validation
+from graderd.api.session import session_routes
 from graderd.api.settings import ApiLimits
 from graderd.api.sockets import socket_routes
 from graderd.api.stop import StopLane
@@ -54,6 +55,7 @@ def make_app(port: DaemonPort, limits: ApiLimits | None = None) -> FastAPI:
     texts = StatusTexts()
     app.include_router(http_routes(port, limits, texts, app.state.stops))
     app.include_router(socket_routes(port, limits, texts, app.state.closing, app.state.stops))
+    app.include_router(session_routes())
     app.add_middleware(Limiter, limits=limits, closing=app.state.closing)
     for kind, handler in _handlers().items():
         app.add_exception_handler(kind, handler)

@@ -17,12 +17,14 @@ LINE_BYTES = 256
 
 class JudgedConnection(h11.Connection):
     """h11's parser, which gives nobody a request whose head was not judged. ``line``: how the newest request begins,
-    as it came."""
+    as it came. ``known``: what is known of whoever sent the newest, its ``grant``; the application gets it as the
+    request's state."""
 
     def __init__(self, guard: TcpGuard | None) -> None:
         super().__init__(h11.SERVER, HEAD_MAX_BYTES)
         self._guard = guard
         self.line = b""
+        self.known: dict[str, Any] = {}
 
     def receive_data(self, data: bytes) -> None:
         """As in h11."""
@@ -42,9 +44,11 @@ class JudgedConnection(h11.Connection):
             size_n = len(event.target) + sum(len(name) + len(value) + 4 for name, value in event.headers)
             if size_n > HEAD_MAX_BYTES:
                 raise h11.RemoteProtocolError("too long a head", error_status_hint=431)
-            refusal = self._guard.refusal(event.target, event.headers) if self._guard is not None else None
-            if refusal is not None:
-                raise RefusedError(refusal)
+            if self._guard is not None:
+                try:
+                    self.known["grant"] = self._guard.admit(event.method, event.target, event.headers)
+                except ProblemError as refusal:
+                    raise RefusedError(refusal) from refusal
             self.line = b""
         return event
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections import OrderedDict
 from collections.abc import Coroutine
 from typing import Annotated, Any, TypeVar
@@ -15,7 +16,8 @@ from graderd.api.port import DaemonPort, ServiceError
 from graderd.api.problem import Problem, ProblemError
 from graderd.api.settings import ApiLimits
 from graderd.api.stop import StopLane
-from graderd.core.commands import AnyCommand, Command, Reply, Stop
+from graderd.api.tcp_guard import Grant
+from graderd.core.commands import AnyCommand, Command, Release, Renew, Reply, Stop
 from graderd.core.status import Status
 from graderd.hal.device import DeviceService
 from graderd.hal.text import printable
@@ -49,6 +51,7 @@ PICTURE_AGE = "Picture-Age-S"
 PICTURE_AGE_SCHEMA = {"description": "seconds since the picture was taken", "schema": {"type": "number"}}
 UPGRADE = "open it as a WebSocket, or use the client or 'graderd'"
 T = TypeVar("T")
+log = logging.getLogger(__name__)
 NAMES_N = 1000
 """More than connections can be open."""
 STOP_BODY: dict[str, Any] = {
@@ -108,14 +111,14 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: 
         WebSocket `/v1/jog` does that too, and gives the lease back at once when the connection ends.
         """
         asked = command.model_copy(update={"client": names.of(command.client, request)})
-        return accepted(await obey(port, asked, limits))
+        return accepted(await obey(port, asked, limits, asker_of(request)))
 
     @router.post("/stop", tags=["commands"], summary="End motion at once", openapi_extra=STOP_BODY)
     async def stop(request: Request) -> Reply:
         """Wins over everything, latches, may be repeated; served ahead of every other request and never refused. The
         request line is the stop: motion ends whatever the body is, which only says why; what was not understood of it
         is told in `message`. Every other method does the same."""
-        return await stops.serve(request.receive)
+        return await stops.serve(request.receive, asker_of(request))
 
     @router.get("/config", tags=["status"], summary="The configuration in force")
     async def config() -> dict[str, Any]:
@@ -144,8 +147,10 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: 
         _add_service(router, port, name, offered)
 
     @router.post("/services/{name}", include_in_schema=False)
-    async def unknown_service(name: Annotated[str, Path(max_length=80, pattern=r"^[a-z_.]+$")]) -> dict[str, Any]:
-        return await _served(port, name, {})
+    async def unknown_service(
+        name: Annotated[str, Path(max_length=80, pattern=r"^[a-z_.]+$")], request: Request
+    ) -> dict[str, Any]:
+        return await _served(port, name, {}, asker_of(request))
 
     return router
 
@@ -167,7 +172,7 @@ def _add_service(router: APIRouter, port: DaemonPort, name: str, offered: Device
         if offered.moves:
             raise ProblemError(426, f"{name} moves the blade for as long as its client renews", name, UPGRADE)
         given = {} if arguments is None else arguments.model_dump(exclude_unset=True)
-        return await _while_connected(request, _served(port, name, given))
+        return await _while_connected(request, _served(port, name, given, asker_of(request)))
 
     service.__annotations__ = {
         "request": Request,
@@ -189,7 +194,8 @@ def _add_service(router: APIRouter, port: DaemonPort, name: str, offered: Device
     )
 
 
-async def _served(port: DaemonPort, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
+async def _served(port: DaemonPort, name: str, arguments: dict[str, Any], by: str) -> dict[str, Any]:
+    log.info("service %s by %s", name, by)
     try:
         return await port.service(name, arguments)
     except ServiceError as error:
@@ -217,8 +223,8 @@ async def _disconnected(request: Request) -> None:
 
 
 class ConnectionNames:
-    """The names that leases go by: what a client called itself first on its connection, and the number of that
-    connection, which is the daemon's to give and nobody else's."""
+    """The names that leases go by: what a client called itself first on its connection, the name of its token, and the
+    number of that connection; the two are the daemon's to give and nobody else's."""
 
     def __init__(self) -> None:
         self._names: OrderedDict[int, str] = OrderedDict()
@@ -227,20 +233,51 @@ class ConnectionNames:
         """The name of whoever speaks on this connection."""
         number = connection.client.port if connection.client is not None else 0
         if number not in self._names:
-            self._names[number] = f"{printable(given) or 'client'}#{number}"
+            grant = grant_of(connection)
+            at = (
+                f"@{grant.name}" if grant is not None and connection.client and connection.client.host != "unix" else ""
+            )
+            self._names[number] = f"{printable(given) or 'client'}{at}#{number}"
             if len(self._names) > NAMES_N:
                 self._names.popitem(last=False)
         return self._names[number]
 
 
-async def obey(port: DaemonPort, command: Command, limits: ApiLimits) -> Reply:
-    """Hand a command over and wait for its reply, not for ever.
+def grant_of(connection: HTTPConnection) -> Grant | None:
+    """Who asks, and with what right; None: anybody, for the page's own files."""
+    grant: Grant | None = getattr(connection.state, "grant", None)
+    return grant
+
+
+def asker_of(connection: HTTPConnection) -> str:
+    """Who asks, for the log: the name of the token or the user, and where from."""
+    grant = grant_of(connection)
+    return f"{grant.name if grant else 'nobody'} at {connection.client.host if connection.client else '-'}"
+
+
+async def obey(port: DaemonPort, command: Command, limits: ApiLimits, by: str) -> Reply:
+    """Hand a command over and wait for its reply, not for ever. What was asked, ``by`` whom, and what came of it goes
+    into the log; keeping a lease does not.
 
     Raises:
         ProblemError: 504, the control tick did not answer.
     """
     if isinstance(command, Stop):
-        return port.stop(command)
+        reply = port.stop(command)
+    else:
+        reply = await _answered(port, command, limits)
+    if not isinstance(command, Renew | Release):
+        what = f"refused: {reply.message}" if not reply.accepted else reply.message
+        log.info("%s by %s (%s): %s", _words(command), command.client, by, what, extra={"client": command.client})
+    return reply
+
+
+def _words(command: Command) -> str:
+    given = command.model_dump(exclude={"command", "client"}, exclude_defaults=True)
+    return " ".join((command.command, *(f"{name}={value}" for name, value in given.items())))
+
+
+async def _answered(port: DaemonPort, command: Command, limits: ApiLimits) -> Reply:
     try:
         async with asyncio.timeout(limits.command_timeout_s):
             return await port.command(command)

@@ -10,10 +10,12 @@ import itertools
 import logging
 import os
 import socket
+import ssl
 import stat
+import struct
 import sys
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -28,9 +30,10 @@ from graderd.api.http_head import JudgedConnection, problem_of_head
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.api.stop import StopLane, is_stop_line
 from graderd.api.stop_socket import serving_stops, stop_socket_beside
-from graderd.api.tcp_guard import TcpGuard, load_or_make_token
+from graderd.api.tcp_guard import Grant, TcpGuard, Tokens
 from graderd.hal.clock import Pace
 from graderd.hal.errors import DeviceError
+from graderd.tokens import Right
 
 MAX_PATH_BYTES = 107
 SOCKET_CHECK_S = 1.0
@@ -171,6 +174,27 @@ def tcp_socket(host: str, port_n: int) -> Iterator[socket.socket]:
         yield listener
 
 
+def tls_context(tcp: TcpSettings) -> ssl.SSLContext | None:
+    """What TLS is spoken with; None: none.
+
+    Raises:
+        DeviceError: certificate or key cannot be used, or others may read the key.
+    """
+    if tcp.certificate_file is None or tcp.key_file is None:
+        return None
+    where = f"api tcp {tcp.certificate_file}, {tcp.key_file}"
+    try:
+        if tcp.key_file.stat().st_mode & 0o007:
+            raise DeviceError(where, "others may read the key", f"chmod 600 {tcp.key_file}")
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        context.load_cert_chain(tcp.certificate_file, tcp.key_file, lambda: "")
+    except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
+        remedy = "give a PEM certificate and its key, without a passphrase, which the daemon may read"
+        raise DeviceError(where, str(error), remedy) from error
+    return context
+
+
 ACCEPT_BURST_N = 20
 ACCEPT_RETRY_S = 0.1
 LISTEN_QUEUE_N = 128
@@ -178,6 +202,9 @@ STREAM_BUFFER_BYTES = 16_384
 READ_BYTES = 1024
 """Some hundred of the smallest frames: a few milliseconds."""
 LINGER_S = 0.5
+HANDSHAKE_S = 5.0
+HANDSHAKES_N = 64
+"""Under way at once; the oldest makes room for a new one."""
 LOST_AFTER_S = 3
 
 
@@ -198,24 +225,28 @@ async def serve(
     Raises:
         SocketInUseError: another daemon has the socket; it is not disturbed.
         SocketError: the socket cannot be made, or not with these rights.
-        DeviceError: the token file is not usable.
+        DeviceError: the token file, the certificate or its key is not usable.
     """
     limits = limits or ApiLimits()
     stops: StopLane = app.state.stop_socket
     async with contextlib.AsyncExitStack() as stack:
         listener = stack.enter_context(unix_socket(socket_path, socket_mode, socket_group))
         servers = [_Server(_config(app, limits), listener, limits)]
+        helpers: list[Coroutine[Any, Any, None]] = []
         stop_listener = stack.enter_context(unix_socket(stop_socket_beside(socket_path), socket_mode, socket_group))
         await stack.enter_async_context(serving_stops(stop_listener, stops))
         if tcp is not None:
             listener = stack.enter_context(tcp_socket(tcp.host, tcp.port_n))
             stop_listener = stack.enter_context(tcp_socket(tcp.host, tcp.port_of_stop_n()))
-            token = load_or_make_token(tcp.token_file)
+            tls = tls_context(tcp)
+            tokens = Tokens(tcp.token_file)
             ports = (listener.getsockname()[1], stop_listener.getsockname()[1])
-            guard, stop_guard = (TcpGuard(token, port_n, tcp.allowed_hosts) for port_n in ports)
-            await stack.enter_async_context(serving_stops(stop_listener, stops, stop_guard))
-            servers.append(_Server(_config(app, limits, guard), listener, limits))
+            guard, stop_guard = (TcpGuard(tokens, port_n, tcp.allowed_hosts) for port_n in ports)
+            await stack.enter_async_context(serving_stops(stop_listener, stops, stop_guard, tls))
+            servers.append(_Server(_config(app, limits, guard), listener, limits, tls))
+            helpers.append(tokens.keep_watching())
         tasks = [asyncio.create_task(server.run_until_told(), name=f"api server {server.name}") for server in servers]
+        tasks += [asyncio.create_task(helper, name="api tokens") for helper in helpers]
 
         async def serve_again(listener: socket.socket) -> None:
             servers[0].accept_also(listener)
@@ -299,9 +330,13 @@ class _Server(uvicorn.Server):
     """uvicorn on one socket of ours. It ends when ``should_exit`` is set and by nothing else: signals belong to the
     daemon. It takes new connections one by one and at a pace: asyncio's own server takes all that wait at once."""
 
-    def __init__(self, config: uvicorn.Config, listener: socket.socket, limits: ApiLimits) -> None:
+    def __init__(
+        self, config: uvicorn.Config, listener: socket.socket, limits: ApiLimits, tls: ssl.SSLContext | None = None
+    ) -> None:
         super().__init__(config)
         self._listener = listener
+        self._tls = tls
+        self._handshakes: dict[asyncio.Task[None], None] = {}
         self._pace = Pace(limits.accept_rate_hz, ACCEPT_BURST_N)
         self._also_accepting: list[asyncio.Task[None]] = []
         self.answering = asyncio.Event()
@@ -320,8 +355,9 @@ class _Server(uvicorn.Server):
             await asyncio.wait((accepting, serving), return_when=asyncio.FIRST_COMPLETED)
         finally:
             self.should_exit = True
-            for task in (accepting, *self._also_accepting):
+            for task in (accepting, *self._also_accepting, *self._handshakes):
                 task.cancel()
+            await asyncio.gather(*self._handshakes, return_exceptions=True)
             results = await asyncio.gather(accepting, *self._also_accepting, serving, return_exceptions=True)
         for result in results:
             if isinstance(result, Exception):
@@ -355,8 +391,26 @@ class _Server(uvicorn.Server):
                 continue
             if connection.family != socket.AF_UNIX:
                 _notice_loss(connection)
-            await loop.connect_accepted_socket(self._protocol, connection)
+            if self._tls is None:
+                await loop.connect_accepted_socket(self._protocol, connection)
+            else:
+                self._begin_handshake(connection)
             await asyncio.sleep(self._pace.delay_s(loop.time()))
+
+    def _begin_handshake(self, connection: socket.socket) -> None:
+        """Who is slow at it, or says nothing, keeps nobody else waiting."""
+        if len(self._handshakes) >= HANDSHAKES_N:
+            next(iter(self._handshakes)).cancel()
+        task = asyncio.create_task(self._shake_hands(connection), name=f"api handshake {self.name}")
+        self._handshakes[task] = None
+        task.add_done_callback(self._handshakes.pop)
+
+    async def _shake_hands(self, connection: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        with contextlib.suppress(OSError):  # no TLS, or gone: a stranger's affair
+            await loop.connect_accepted_socket(
+                self._protocol, connection, ssl=self._tls, ssl_handshake_timeout=HANDSHAKE_S
+            )
 
     def _protocol(self) -> asyncio.Protocol:
         protocol = cast("type[H11Protocol]", self.config.http_protocol_class)
@@ -379,10 +433,10 @@ class _SmallReads(asyncio.BufferedProtocol):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._piece = bytearray(READ_BYTES)
+        self._piece = memoryview(bytearray(READ_BYTES))
 
-    def get_buffer(self, sizehint: int) -> bytearray:
-        """Where the transport puts the next piece."""
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Where the transport puts the next piece; TLS cuts it, and a cut of a bytearray would be a copy."""
         del sizehint
         return self._piece
 
@@ -407,6 +461,13 @@ def _numbered(client: tuple[str, int] | None) -> tuple[str, int]:
     return (client[0] if client is not None else "unix", next(_numbers))
 
 
+def _user_of(transport: asyncio.BaseTransport) -> str:
+    """Who is at the other end of a unix socket, as the kernel says."""
+    connection = transport.get_extra_info("socket")
+    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    return f"uid {struct.unpack('3i', credentials)[1]}"
+
+
 def _bounded_http(limits: ApiLimits, guard: TcpGuard | None, stops: StopLane) -> type[H11Protocol]:
     """uvicorn's HTTP protocol with a bound on open connections: the oldest makes room for a new one, so that a client
     that wants to send stop gets in however many hang about."""
@@ -416,11 +477,14 @@ def _bounded_http(limits: ApiLimits, guard: TcpGuard | None, stops: StopLane) ->
         def __init__(self, *args: Any, **kwargs: Any) -> None:
             super().__init__(*args, **kwargs)
             self.conn = self._judged = JudgedConnection(guard)
+            self.app_state = self._judged.known
             self._ending: asyncio.TimerHandle | None = None
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as in uvicorn
             super().connection_made(transport)
             self.client = _numbered(self.client)
+            if guard is None:
+                self._judged.known["grant"] = Grant(_user_of(transport), Right.COMMAND)
             open_connections[self] = None
             if len(open_connections) > limits.connections_max_n:
                 oldest, _ = open_connections.popitem(last=False)
@@ -470,7 +534,7 @@ class _StreamProtocol(_SmallReads, WebSocketsSansIOProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
         self.client = _numbered(self.client)
-        self.transport.set_write_buffer_limits(high=0)
+        self.transport.set_write_buffer_limits(high=1)  # TLS would take 0 for never
         connection = transport.get_extra_info("socket")
         if connection is not None:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, STREAM_BUFFER_BYTES)

@@ -6,22 +6,25 @@ from pathlib import Path
 
 from pydantic import Field, model_validator
 
+from graderd import places
 from graderd.hal.settings import Positive, Settings
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 
 
 class TcpSettings(Settings):
-    """The interface on TCP. It speaks plain HTTP: beyond loopback it belongs behind a tunnel or a TLS proxy."""
+    """The interface on TCP, and the operator page. Beyond loopback it speaks TLS."""
 
     host: str = Field("127.0.0.1", description="address to listen on")
     port_n: int = Field(8431, ge=0, le=65535, description="TCP port; 0: any free one")
     stop_port_n: int | None = Field(
         None, ge=0, le=65535, description="TCP port that serves stop alone; none: the one after port_n"
     )
-    token_file: Path = Field(
-        Path("/var/lib/graderd/api-token"), description="holds the token clients must send; made at first start"
+    token_file: Path = Field(places.TOKENS, description="tokens that clients must send, hashed; see 'graderd token'")
+    certificate_file: Path | None = Field(
+        None, description="PEM certificate, and those up to its authority; with it the interface speaks TLS alone"
     )
+    key_file: Path | None = Field(None, description="PEM private key of the certificate, readable by the daemon alone")
     allowed_hosts: tuple[str, ...] = Field(
         (), description="names or addresses, beside the loopback ones, under which clients may reach this machine"
     )
@@ -34,7 +37,14 @@ class TcpSettings(Settings):
 
     @model_validator(mode="after")
     def _named(self) -> TcpSettings:
+        if (self.certificate_file is None) != (self.key_file is None):
+            raise ValueError("certificate_file and key_file go together: give both, or neither")
         loopback = self.host in ("127.0.0.1", "::1", "localhost")
+        if not loopback and self.certificate_file is None:
+            raise ValueError(
+                f"host {self.host} is not loopback, and without TLS anybody on the way reads the tokens: give "
+                "certificate_file and key_file, or keep 127.0.0.1 and use an SSH tunnel"
+            )
         if not loopback and not self.allowed_hosts:
             raise ValueError(
                 f"host {self.host} is not loopback: list in allowed_hosts the names by which clients reach it, "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 from collections.abc import AsyncGenerator, Coroutine
 from typing import Annotated, Any
 
@@ -12,21 +13,25 @@ from fastapi import APIRouter, Query, WebSocket
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from starlette.websockets import WebSocketDisconnect
 
-from graderd.api.http_routes import ConnectionNames, StatusTexts, obey, service_request
+from graderd.api.http_routes import ConnectionNames, StatusTexts, asker_of, grant_of, obey, service_request
 from graderd.api.limiter import Closing
 from graderd.api.port import DaemonPort, ServiceError
 from graderd.api.problem import Problem, ProblemError, answer, problem_of_validation
 from graderd.api.settings import ApiLimits
 from graderd.api.stop import StopLane, is_stop_command
+from graderd.api.tcp_guard import Grant
 from graderd.core.commands import AnyCommand, Command, Jog, Preset, Release, Reply
 from graderd.core.status import Status
 from graderd.hal.text import printable
 
 COMMAND: TypeAdapter[Command] = TypeAdapter(AnyCommand)
 MALFORMED_PAUSE_S = 0.1
+POLICY = 1008
+"""RFC 6455: the connection was closed because its other end may not have it."""
 TOO_LARGE = 1009
 """RFC 6455: the connection was closed because of a message too large to be read."""
 TOO_LARGE_REASON = b'{"reason": "a message too large to be read"}'
+log = logging.getLogger(__name__)
 UPGRADE_ONLY: dict[int | str, dict[str, Any]] = {
     101: {"description": "the WebSocket is open"},
     426: {"model": Problem, "description": "asked for without a WebSocket upgrade"},
@@ -47,7 +52,7 @@ def socket_routes(
     @router.websocket("/jog")
     async def jog(socket: WebSocket, client: Annotated[str, Query(max_length=60)] = "jog") -> None:
         await socket.accept()
-        session = _JogSession(port, limits, stops, ConnectionNames().of(client, socket))
+        session = _JogSession(port, limits, stops, ConnectionNames().of(client, socket), asker_of(socket))
         try:
             await _until_closed(socket, session.run(socket), closing, reads=True)
         finally:
@@ -61,7 +66,7 @@ def socket_routes(
             await answer(404, problem, socket.scope, socket.receive, socket.send)
             return
         await socket.accept()
-        session = _ManeuverSession(port, limits, stops, name, service_request(name, offered))
+        session = _ManeuverSession(port, limits, stops, name, service_request(name, offered), asker_of(socket))
         await _until_closed(socket, session.run(socket), closing, reads=True)
 
     @router.websocket("/bus/{name}")
@@ -105,7 +110,8 @@ def socket_routes(
 class _JogSession:
     """One client's connection: its commands carry a name nobody else has, so its lease is its own."""
 
-    def __init__(self, port: DaemonPort, limits: ApiLimits, stops: StopLane, client: str) -> None:
+    def __init__(self, port: DaemonPort, limits: ApiLimits, stops: StopLane, client: str, by: str) -> None:
+        self._by = by
         self._port = port
         self._limits = limits
         self._stops = stops
@@ -119,7 +125,7 @@ class _JogSession:
             if message["type"] == "websocket.disconnect":
                 if message.get("code") == TOO_LARGE:
                     # Never read, it may have been a stop.
-                    await self._stops.carry_out(TOO_LARGE_REASON, self._client)
+                    await self._stops.carry_out(TOO_LARGE_REASON, self._client, self._by)
                 return
             text = message.get("text")
             answer = await self._answer(text.encode("utf-8", "replace") if text else message.get("bytes") or b"")
@@ -131,12 +137,12 @@ class _JogSession:
             self._moved = False
             # A tick that does not answer lets the lease lapse by itself, or has stopped: nothing more to do here.
             with contextlib.suppress(ProblemError):
-                await obey(self._port, Release(client=self._client), self._limits)
+                await obey(self._port, Release(client=self._client), self._limits, self._by)
 
     async def _answer(self, text: bytes) -> Reply | Problem:
         if is_stop_command(text):
             self._moved = False
-            return await self._stops.carry_out(text, self._client)
+            return await self._stops.carry_out(text, self._client, self._by)
         try:
             command = COMMAND.validate_json(text).model_copy(update={"client": self._client})
         except ValidationError as error:
@@ -148,7 +154,7 @@ class _JogSession:
         if isinstance(command, Release):
             self._moved = False
         try:
-            reply = await obey(self._port, command, self._limits)
+            reply = await obey(self._port, command, self._limits, self._by)
         except ProblemError as error:
             return error.problem
         return reply
@@ -158,8 +164,9 @@ class _ManeuverSession:
     """A service that moves the blade, for as long as its client is heard."""
 
     def __init__(
-        self, port: DaemonPort, limits: ApiLimits, stops: StopLane, name: str, arguments: type[BaseModel]
+        self, port: DaemonPort, limits: ApiLimits, stops: StopLane, name: str, arguments: type[BaseModel], by: str
     ) -> None:
+        self._by = by
         self._port = port
         self._silence_s = limits.maneuver_lease_s
         self._stops = stops
@@ -177,6 +184,7 @@ class _ManeuverSession:
             problem = problem_of_validation(error.errors(include_input=False, include_url=False))
             await socket.send_text(problem.model_dump_json())
             return
+        log.info("service %s by %s", self._name, self._by)
         working = asyncio.create_task(self._port.service(self._name, given), name=f"api maneuver {self._name}")
         listening = asyncio.create_task(self._listen(socket), name=f"api maneuver {self._name} lease")
         try:
@@ -215,12 +223,12 @@ class _ManeuverSession:
         message = await socket.receive()
         if message["type"] == "websocket.disconnect":
             if message.get("code") == TOO_LARGE:
-                await self._stops.carry_out(TOO_LARGE_REASON)
+                await self._stops.carry_out(TOO_LARGE_REASON, by=self._by)
             return None
         text = message.get("text")
         said = text.encode("utf-8", "replace") if text else bytes(message.get("bytes") or b"")
         if is_stop_command(said):
-            await self._stops.carry_out(said)
+            await self._stops.carry_out(said, by=self._by)
         return said
 
 
@@ -256,6 +264,9 @@ async def _until_closed(
     if not reads:
         # Of a stream's client only the end is of interest.
         tasks.append(asyncio.create_task(_client_gone(socket), name=f"api {path} client"))
+    grant = grant_of(socket)
+    if grant is not None:
+        tasks.append(asyncio.create_task(_revoked(grant), name=f"api {path} token"))
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
@@ -266,10 +277,17 @@ async def _until_closed(
         if closing.begun:
             with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                 await socket.close(1001, "the daemon ends")
+        elif grant is not None and grant.ended.is_set():
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                await socket.close(POLICY, "the token is no longer in force")
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _revoked(grant: Grant) -> None:
+    await grant.ended.wait()
 
 
 async def _client_gone(socket: WebSocket) -> None:

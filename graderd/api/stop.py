@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import re
 from typing import Any
 
@@ -26,6 +27,8 @@ GRACE_S = 0.005
 """A body that comes with its request line is read with it. One that does not is not waited for."""
 DRAIN_S = 0.5
 """What still comes of the body after the stop is thrown away for so long, so that its sender can read the answer."""
+
+log = logging.getLogger(__name__)
 _MOST_CHARACTERS = {"reason": 200, "client": 80}
 _COMMAND = re.compile(rb'"command"\s*:\s*"stop"')
 
@@ -95,20 +98,22 @@ class StopLane:
         self._port = port
         self._pace = Pace(limits.stop_rate_hz, max(1, round(limits.stop_rate_hz / 10)))
 
-    async def carry_out(self, body: bytes, client: str = "") -> Reply:
-        """Stop now. ``client``: the name that counts, where it is not the body's to give."""
+    async def carry_out(self, body: bytes, client: str = "", by: str = "") -> Reply:
+        """Stop now. ``client``: the name that counts, where it is not the body's to give; ``by``: who that is, for the
+        log."""
         command, problem = stop_of(body)
         if client:
             command = command.model_copy(update={"client": client})
         await self._turn()
         reply = self._port.stop(command)
+        log.info("stop by %s (%s): %s", command.client or "-", by, reply.message, extra={"client": command.client})
         return reply.model_copy(update={"message": f"{reply.message} ({problem})"}) if problem else reply
 
     def at_once(self) -> Reply:
         """Stop for a request of which only the first line could be read."""
         return self._port.stop(Stop(reason=REASON))
 
-    async def serve(self, receive: Receive) -> Reply:
+    async def serve(self, receive: Receive, by: str) -> Reply:
         """Stop for an HTTP request whose line has come; its body is taken as far as it has come with it."""
         body = bytearray()
         complete = False
@@ -117,7 +122,7 @@ class StopLane:
                 complete = await _read(receive, body)
         except TimeoutError:
             pass
-        reply = await self.carry_out(bytes(body))
+        reply = await self.carry_out(bytes(body), by=by)
         if not complete:
             try:
                 async with asyncio.timeout(DRAIN_S):

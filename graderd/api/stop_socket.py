@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import ssl
 from collections import OrderedDict
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -34,7 +35,9 @@ def stop_socket_beside(path: Path) -> Path:
 
 
 @contextlib.asynccontextmanager
-async def serving_stops(listener: socket.socket, stops: StopLane, guard: TcpGuard | None = None) -> AsyncIterator[None]:
+async def serving_stops(
+    listener: socket.socket, stops: StopLane, guard: TcpGuard | None = None, tls: ssl.SSLContext | None = None
+) -> AsyncIterator[None]:
     """Serve stops on a bound socket for as long as the block lasts."""
     loop = asyncio.get_running_loop()
     open_connections: OrderedDict[_StopProtocol, None] = OrderedDict()
@@ -45,7 +48,10 @@ async def serving_stops(listener: socket.socket, stops: StopLane, guard: TcpGuar
     if listener.family == socket.AF_UNIX:
         server = await loop.create_unix_server(protocol, sock=listener, backlog=QUEUE_N)
     else:
-        server = await loop.create_server(protocol, sock=listener, backlog=QUEUE_N)
+        shake_s = None if tls is None else TIMEOUT_S
+        server = await loop.create_server(
+            protocol, sock=listener, backlog=QUEUE_N, ssl=tls, ssl_handshake_timeout=shake_s
+        )
     try:
         yield
     finally:
@@ -146,7 +152,8 @@ class _StopProtocol(asyncio.Protocol):
             self._stopping = asyncio.get_running_loop().create_task(self._stop(words), name="api stop socket")
 
     async def _stop(self, words: bytes) -> None:
-        reply = await self._stops.carry_out(words)
+        grant = self._connection.known.get("grant")
+        reply = await self._stops.carry_out(words, by=grant.name if grant is not None else "the stop socket")
         self._answer(200, reply.model_dump_json().encode())
 
     def _answer(self, status_code: int, body: bytes) -> None:

@@ -21,6 +21,7 @@ from graderd.cli import (
     profile,
     rotation,
     status,
+    token,
 )
 from graderd.cli.console import CliError, ExitCode, print_error, print_text
 from graderd.client import ClientError, NoDaemonError
@@ -41,6 +42,7 @@ COMMANDS = (
     classify,
     evaluate,
     calibrate,
+    token,
 )
 
 

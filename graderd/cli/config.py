@@ -29,7 +29,7 @@ def register(app: typer.Typer) -> None:
         """
         from graderd.runtime.app import problems
 
-        refusals = problems(_load(file, json))
+        refusals = problems(load_or_refuse(file, json))
         if refusals:
             _refuse([f"{file or places.CONFIG}: {line}" for line in refusals], json)
         if json:
@@ -40,14 +40,15 @@ def register(app: typer.Typer) -> None:
     @config.command(epilog=example("graderd config show", "graderd config show graderd.toml --json"))
     def show(file: File = None, json: Json = False) -> None:
         """Print the configuration as it takes effect, defaults included."""
-        resolved = _load(file, json).model_dump(mode="json")
+        resolved = load_or_refuse(file, json).model_dump(mode="json")
         if json:
             print_json(resolved)
         else:
             print_text(_toml(resolved))
 
 
-def _load(file: Path | None, as_json: bool) -> Config:
+def load_or_refuse(file: Path | None, as_json: bool) -> Config:
+    """The configuration; a command without a valid one ends with what is wrong with it."""
     from graderd.config import ConfigError, load
 
     try:

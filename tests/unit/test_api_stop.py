@@ -18,6 +18,7 @@ from graderd.api.server import ACCEPT_BURST_N
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.api.stop_socket import stop_socket_beside
 from graderd.core.machine import Mode
+from graderd.tokens import Right, create_token
 from harness.api_daemon import serving, within
 from tests.unit.test_api_sockets import connect
 
@@ -216,9 +217,9 @@ async def test_who_only_connects_to_the_stop_socket_stops_nothing(tmp_path: Path
 
 async def test_the_stop_port_needs_the_token(tmp_path: Path) -> None:
     port_n = free_port()
-    tcp = TcpSettings(port_n=0, stop_port_n=port_n, token_file=tmp_path / "token")
+    tcp = TcpSettings(port_n=0, stop_port_n=port_n, token_file=tmp_path / "tokens")
+    token = create_token(tcp.token_file, "test", Right.READ)
     async with serving(tmp_path, tcp=tcp) as (daemon, _):
-        token = (tmp_path / "token").read_text("ascii").strip()
         for given, status_code in (("", 401), (f"Authorization: Bearer {token}\r\n", 200)):
             reader, writer = await asyncio.open_connection("127.0.0.1", port_n)
             assert daemon.state.mode is Mode.DISARMED

@@ -24,7 +24,7 @@ def test_there_are_thirty_over_the_three_rooms() -> None:
     assert len({mutant.name for mutant in MUTANTS}) == len(MUTANTS) == 30
     assert {mutant.file.rpartition("/")[0].split("/")[0] for mutant in DRIVERS} == {"drivers"}
     assert all(mutant.file.startswith("graderd/runtime/") for mutant in RUNTIME)
-    assert all(mutant.file.startswith("graderd/api/") for mutant in API)
+    assert all(mutant.file.startswith(("graderd/api/", "graderd/tokens.py")) for mutant in API)
     assert [len(part) for part in (RUNTIME, DRIVERS, API)] == [10, 12, 8]
 
 
