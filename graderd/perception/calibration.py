@@ -35,6 +35,8 @@ POSE = ("position_x_m", "position_y_m", "position_z_m", "pitch_down_deg", "yaw_d
 GEOMETRY = ("x_offset_m", "length_m", "height_m")
 STANCE = ("edge_height_m", "edge_slope_deg", "edge_pitch_deg")
 """How the blade stood in all frames, beyond what was measured."""
+GEOMETRY_AT = slice(len(POSE), len(POSE) + len(GEOMETRY))
+STANCE_AT = slice(GEOMETRY_AT.stop, None)
 STEPS = np.array([1e-4, 1e-4, 1e-4, 5e-3, 5e-3, 5e-3, 1e-4, 1e-4, 1e-4, 1e-4, 5e-3, 5e-3])
 """Steps of the numerical derivatives: metres and degrees."""
 BANDS_M = (0.14, 0.10, 0.07, 0.05, 0.035, 0.025, 0.02, 0.015, 0.012)
@@ -57,6 +59,14 @@ OFF_DRAWING_M = 0.02
 """A blade that differs from its drawing by more than this is another blade, or was not where it was said to be."""
 COLOR_ONLY_SIGMA_M = 0.003
 """Without depth the picture tells only ratios: the blade's size must be known, and sets the scale."""
+COLOR_FROM_BAND_M = 0.05
+"""Where there is depth, colour has a say from this band on: further away any edge may pass for the blade's."""
+EDGE_WORTH_N, MIN_EVIDENCE_N = 10, 100
+"""An edge's point counts as ten of the face; a frame that gives less than a hundred in all does not show the blade."""
+CORRELATED_N = 10.0
+"""Neighbouring depth points err alike: so many of them tell as much as one that is free."""
+INLIER_SHARE = 0.95
+"""The rms leaves out the outermost: points on something else that passed the robust weight."""
 MIN_FRAMES_N, MIN_SPAN_DEG = 3, 20.0
 """Frames, and blade angles between the outermost: with less, place and angle of the camera are not told apart."""
 MAX_RESIDUAL_MM, MAX_RESIDUAL_PX = 12.0, 6.0
@@ -164,11 +174,11 @@ class _Solver:
             self._prior_sigma[len(POSE) + GEOMETRY.index("height_m")] = AS_DRAWN_SIGMA_M
 
     def _model(self, p: F64) -> tuple[CameraCalibration, BladeGeometry]:
-        calibration = with_pose(self._start, dict(zip(POSE, map(float, p[:6]), strict=True)))
-        return calibration, self._blade.model_copy(update=dict(zip(GEOMETRY, map(float, p[6:9]), strict=True)))
+        calibration = with_pose(self._start, dict(zip(POSE, map(float, p[: GEOMETRY_AT.start]), strict=True)))
+        return calibration, self._blade.model_copy(update=dict(zip(GEOMETRY, map(float, p[GEOMETRY_AT]), strict=True)))
 
     def _stance(self, view: EmptyBlade, p: F64) -> Stance:
-        height_m, slope_deg, pitch_deg = map(float, p[9:])
+        height_m, slope_deg, pitch_deg = map(float, p[STANCE_AT])
         said = Stance(view.blade_angle_deg, view.attitude)
         attitude = MeasuredAttitude(
             (said.edge_m(self._blade) + height_m) * 1000.0,
@@ -194,10 +204,11 @@ class _Solver:
             stance = self._stance(view, self._p)
             if view.frame.depth_mm is not None:
                 self._depth.append(collect_depth(view.frame.depth_mm, depth_view, blade, stance, band_m))
-            if band_m <= 0.05 or view.frame.depth_mm is None:
+            if band_m <= COLOR_FROM_BAND_M or view.frame.depth_mm is None:
                 found = collect_color(view.frame.color_bgr, color_view, blade, stance, band_m)
                 self._color.append(found)
-        if sum(len(e.face) for e in self._depth) + 10 * sum(len(e.at_px) for e in self._color) < 100 * len(self._views):
+        evidence_n = sum(len(e.face) for e in self._depth) + EDGE_WORTH_N * sum(len(e.at_px) for e in self._color)
+        if evidence_n < MIN_EVIDENCE_N * len(self._views):
             raise CalibrationError(
                 "the blade was not found where the starting pose says; clear the soil before the blade, "
                 "or enter the measured pose with --pose"
@@ -235,8 +246,7 @@ class _Solver:
         prior = np.diag(1.0 / self._prior_sigma**2)
         weight = 1.0 / (1.0 + (r / 3.0) ** 2)  # Cauchy: an edge of soil or a hose has little say
         data = jacobian.T @ (jacobian * weight[:, None])
-        # Neighbouring pixels err together: for the uncertainty a tenth of them counts.
-        self._information = data / 10.0 + prior
+        self._information = data / CORRELATED_N + prior
         pull = prior @ (self._first - self._p)
         self._p = self._p + np.linalg.solve(data + prior, -jacobian.T @ (weight * r) + pull)
 
@@ -253,9 +263,9 @@ class _Solver:
         ]
         residual_mm = _robust_rms(np.concatenate(parts_mm)) if parts_mm else None
         edges = np.concatenate(parts_px) if parts_px else np.zeros(0)
-        residual_px = _robust_rms(edges) if edges.size >= 10 * len(self._views) else None
+        residual_px = _robust_rms(edges) if edges.size >= EDGE_WORTH_N * len(self._views) else None
         sigma = np.sqrt(np.diag(np.linalg.inv(self._information)))
-        uncertainty = dict(zip((*POSE, *GEOMETRY), map(float, sigma[:9]), strict=True))
+        uncertainty = dict(zip((*POSE, *GEOMETRY), map(float, sigma[: STANCE_AT.start]), strict=True))
         self._judge(residual_mm, residual_px, uncertainty)
         self._compare_with_drawing(blade)
         self._check_empty_bed(calibration, blade)
@@ -317,8 +327,8 @@ class _Solver:
 
 
 def _robust_rms(values: F64) -> float:
-    """Root mean square of the better 95 %."""
+    """Root mean square without the outermost."""
     if values.size == 0:
         return 0.0
-    kept = np.sort(np.abs(values))[: max(1, int(0.95 * values.size))]
+    kept = np.sort(np.abs(values))[: max(1, int(INLIER_SHARE * values.size))]
     return float(np.sqrt(np.mean(kept**2)))

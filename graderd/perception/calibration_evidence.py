@@ -14,12 +14,12 @@ from graderd.hal.camera import DepthImage, Intrinsics, StreamPose
 from graderd.perception.geometry import F64, U8, View, blade_points_m, face_setback_m
 from graderd.perception.registration import Stance
 
-MAX_FACE_POINTS_N = 700
-MAX_GROUND_POINTS_N = 700
-EDGE_POINTS_N = 48
-ENDS_BANDS_N = 10
-TOP_BANDS_N = 16
+MAX_FACE_POINTS_N, MAX_GROUND_POINTS_N = 700, 700
 """Enough for a fit to 1 mm under the noise of one frame; more only cost time."""
+EDGE_POINTS_N, ENDS_BANDS_N, TOP_BANDS_N = 48, 10, 16
+"""Points on each edge of the outline in colour, and bands in which depth shows where the face ends: as for points."""
+TINY = 1e-9
+"""Against a division by nothing."""
 LEAST_BAND_POINTS_N = 40
 """A band with fewer points says nothing of where the face ends in it."""
 NEARBY_M = 0.2
@@ -199,6 +199,7 @@ class ColorEvidence:
 
 
 TOP, LEFT_END, RIGHT_END = 0, 1, 2
+"""Sides of the outline."""
 
 
 def _outline_m(
@@ -222,7 +223,7 @@ def collect_color(color_bgr: U8, view: View, blade: BladeGeometry, stance: Stanc
     at = view.project(_outline_m(blade, stance, side, shares))
     nearby = view.project(_outline_m(blade, stance, side, shares + TANGENT_SHARE))
     tangent = nearby - at
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), TINY)
     normal = np.column_stack((-tangent[:, 1], tangent[:, 0]))
     distance = float(np.linalg.norm(view.position_m[:2])) or 1.0
     reach = int(np.clip(band_m * view.lens.fx / distance * FORESHORTENED, *EDGE_REACH_PX))
@@ -238,7 +239,7 @@ def collect_color(color_bgr: U8, view: View, blade: BladeGeometry, stance: Stanc
     index = np.flatnonzero(keep)
     peak = best[index]
     a, b, c = slope[index, peak - 1], slope[index, peak], slope[index, peak + 1]
-    shift = np.clip(0.5 * (a - c) / np.maximum(a - 2 * b + c, -1e9).clip(max=-1e-6), -0.5, 0.5)
+    shift = np.clip(0.5 * (a - c) / np.minimum(a - 2 * b + c, -TINY), -0.5, 0.5)  # top of a parabola
     offset = offsets[1 + peak] + shift
     found = at[index] + normal[index] * offset[:, None]
     return ColorEvidence(side[index], shares[index], found, normal[index])

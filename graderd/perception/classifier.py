@@ -34,7 +34,13 @@ ByColor = Callable[[U8, Region, ColorSettings, DecisionSettings], Verdict]
 BY_COLOR: Mapping[str, ByColor] = {"paper": paper_verdict, "fast_color": fast_color_verdict}
 """The methods that look at the colour picture alone, by ``perception.method``."""
 ANGLE_STEP_DEG = 0.25
+"""The blade's ends move by 2 mm in such a step, a pixel of the colour picture."""
 KEPT_REGIONS_N = 64
+"""Regions of so many steps are kept: the blade's swing of 15 degrees is not worked out again and again."""
+ASPECT_TOLERANCE = 0.02
+"""Lens data of another size apply where the picture has their shape but for rows that a scaler rounded away."""
+HALVED_FROM_PX, QUARTERED_FROM_PX = 500, 1000
+"""Widths from which colour is averaged over 2 x 2 and 4 x 4 pixels: about 250 across are left, 4 mm each."""
 
 
 class Classifier(Protocol):
@@ -153,7 +159,7 @@ class SoilClassifier:
         calibrated = self._calibration.color if stream == "color" else self._calibration.depth
         if lens is None:
             lens = calibrated.intrinsics()
-            if abs(lens.width * height - lens.height * width) > 0.02 * lens.width * height:
+            if abs(lens.width * height - lens.height * width) > ASPECT_TOLERANCE * lens.width * height:
                 return None  # another aspect ratio is another read-out of the sensor: the lens data do not apply
             lens = lens.scaled(width, height)
         key = (stream, lens)
@@ -170,7 +176,9 @@ class SoilClassifier:
             self._regions.move_to_end(key)
             return self._regions[key]
         # The paper's letter works on the full picture; what else needs the region is content with its corners.
-        halvings = 0 if self._settings.method == "paper" or width < 500 else 2 if width >= 1000 else 1
+        halvings = (width >= HALVED_FROM_PX) + (width >= QUARTERED_FROM_PX)
+        if self._settings.method == "paper":
+            halvings = 0
         if view is None:
             region = image_thirds(width, height, halvings, drawing.image_right_is_left(self._mounting))
         else:

@@ -18,7 +18,7 @@ from graderd.perception.settings import ColorSettings, DecisionSettings
 
 def brightness_gain(mean_value: float, settings: ColorSettings) -> float:
     """Factor that brings the mean brightness (0-255) to the target, within the allowed ratio."""
-    wanted = settings.brightness_target_percent * 2.55 / max(mean_value, 1.0)
+    wanted = settings.brightness_target_percent / 100 * 255 / max(mean_value, 1.0)
     most = settings.brightness_gain_max_ratio
     return float(min(max(wanted, 1.0 / most), most))
 

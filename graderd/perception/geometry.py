@@ -25,6 +25,12 @@ LEFT, CENTER, RIGHT = 0, 1, 2
 
 NOMINAL_WIDTH_PX = 848
 """Numbers in pixels of the depth picture are meant for one so wide."""
+TOP_EDGE_POINTS_N = 33
+"""A straight edge needs two; a lens that bends it in the picture, some more."""
+LEAST_REGION_PX = 8
+"""A region narrower or lower than this, at its reduced scale, shows nothing."""
+FRACTION_BITS_N = 4
+"""Of a pixel, in which outlines are filled: sixteenths."""
 NEAR_M = 0.05
 """Nothing nearer than this to the camera is projected."""
 
@@ -101,11 +107,10 @@ def blade_points_m(blade: BladeGeometry, angle_deg: float, s_m: F64, d_m: F64, z
     return np.column_stack((d * cos - s_m * sin, d * sin + s_m * cos, z_m))
 
 
-def top_edge_m(blade: BladeGeometry, angle_deg: float, count: int = 33, margin_m: float = 0.0) -> F64:
-    """Points along the moldboard's upper edge from right to left, ``count`` x 3, ``margin_m`` short of its ends."""
-    half = blade.length_m / 2 - margin_m
-    s = np.linspace(-half, half, count)
-    return blade_points_m(blade, angle_deg, s, np.zeros(count), np.full(count, blade.bottom_z_m + blade.height_m))
+def top_edge_m(blade: BladeGeometry, angle_deg: float) -> F64:
+    """Points along the moldboard's upper edge from right to left, :data:`TOP_EDGE_POINTS_N` x 3."""
+    s = np.linspace(-blade.length_m / 2, blade.length_m / 2, TOP_EDGE_POINTS_N)
+    return blade_points_m(blade, angle_deg, s, np.zeros(s.size), np.full(s.size, blade.bottom_z_m + blade.height_m))
 
 
 def strip_outline_m(blade: BladeGeometry, angle_deg: float, s_from_m: float, s_to_m: float) -> F64:
@@ -167,14 +172,14 @@ def region_of(outlines_px: tuple[F64, F64, F64], width_px: int, height_px: int, 
     right, bottom = np.ceil(np.clip(every.max(axis=0), 0, (width_px, height_px))).astype(int)
     columns = (int(right) - int(left)) // step
     rows = (int(bottom) - int(top)) // step
-    if columns < 8 or rows < 8:
+    if columns < LEAST_REGION_PX or rows < LEAST_REGION_PX:
         return None
     taken = np.zeros((rows, columns), dtype=np.uint8)
     masks: list[U8] = []
     for outline in outlines_px:
         mask = np.zeros((rows, columns), dtype=np.uint8)
         shifted = (outline - (left, top)) / step
-        cv2.fillPoly(mask, [np.round(shifted * 16).astype(np.int32)], 255, shift=4)
+        cv2.fillPoly(mask, [np.round(shifted * (1 << FRACTION_BITS_N)).astype(np.int32)], 255, shift=FRACTION_BITS_N)
         mask[taken > 0] = 0  # borders belong to one third only
         taken |= mask
         masks.append(mask)

@@ -23,9 +23,9 @@ from graderd.perception.settings import HealthSettings
 
 SAMPLE_STEP_PX = (16, 12)
 """Rows and columns: a row costs a walk through memory, a pixel of it hardly anything."""
-TILE_PX = 4
-FLAT_GRAY = 1.6
-"""Standard deviation (grey levels) within a tile of the smoothed sample below which it shows nothing."""
+TILE_PX, FLAT_GRAY = 4, 1.6
+"""Side of a tile of the smoothed sample, and the standard deviation in it (grey levels) below which it shows nothing:
+the sensor's noise alone gives 0.5 to 1."""
 STILL_FLAT_PERCENT = 99.0
 """A photograph may have its smooth sky or wall; only where hardly anything else is left is the lens covered."""
 CLIPPED_GRAY = 250
@@ -40,6 +40,8 @@ BLUR_WIDTH_PX = 1280
 """The picture that the distances of the blur's measure are meant for; a larger one is measured as coarsely."""
 BLUR_ROWS_N = 9
 """Rows looked at: more hardly change the answer, and each costs a walk through memory."""
+BLUR_APART_PX = (2, 4, 16)
+"""Distances at which a row's contrast is compared: within a blur, about its size, and of what the picture shows."""
 BLUR_MIN_CONTRAST = 64.0
 """Square grey levels of four summed pixels."""
 BLUR_GROWTH = 0.1
@@ -233,12 +235,12 @@ def sharpness_ratio(image_bgr: U8, region: Region) -> float:
     band = image_bgr[region.rows, region.columns, 1]
     step = max(4, band.shape[0] // BLUR_ROWS_N)
     usable = band.shape[0] // step * step
-    if usable == 0 or band.shape[1] < 32 * unit:
+    if usable == 0 or band.shape[1] < 2 * BLUR_APART_PX[-1] * unit:
         return 1.0
     lines = band[:usable:step].astype(np.float32)
     for row in range(1, 4):
         lines += band[row:usable:step]
-    two, four, sixteen = (_square_difference(lines, distance * unit) for distance in (2, 4, 16))
+    two, four, sixteen = (_square_difference(lines, distance * unit) for distance in BLUR_APART_PX)
     textured = sixteen - four > np.maximum(BLUR_MIN_CONTRAST, BLUR_GROWTH * four)
     if not textured.any():
         return 1.0
