@@ -148,7 +148,7 @@ CLAIMS: Final = (
     Mutant(
         "F3-own-name",
         "graderd/api/http_routes.py",
-        "            self._names[number] = f\"{printable(given) or 'client'}#{number}\"\n",
+        "            self._names[number] = f\"{printable(given) or 'client'}{at}#{number}\"\n",
         "            self._names[number] = printable(given)\n",
         (SOCKETS + "test_nobody_keeps_somebody_elses_lease",),
         "who takes another's name keeps another's jog going",

@@ -234,9 +234,7 @@ class ConnectionNames:
         number = connection.client.port if connection.client is not None else 0
         if number not in self._names:
             grant = grant_of(connection)
-            at = (
-                f"@{grant.name}" if grant is not None and connection.client and connection.client.host != "unix" else ""
-            )
+            at = f"@{grant.name}" if grant is not None and not is_local(connection) else ""
             self._names[number] = f"{printable(given) or 'client'}{at}#{number}"
             if len(self._names) > NAMES_N:
                 self._names.popitem(last=False)
@@ -247,6 +245,11 @@ def grant_of(connection: HTTPConnection) -> Grant | None:
     """Who asks, and with what right; None: anybody, for the page's own files."""
     grant: Grant | None = getattr(connection.state, "grant", None)
     return grant
+
+
+def is_local(connection: HTTPConnection) -> bool:
+    """Whether it came by the unix socket."""
+    return connection.client is not None and connection.client.host == "unix"
 
 
 def asker_of(connection: HTTPConnection) -> str:

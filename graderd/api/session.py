@@ -7,7 +7,7 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, Field
 
-from graderd.api.http_routes import grant_of
+from graderd.api.http_routes import grant_of, is_local
 from graderd.api.problem import Problem, ProblemError
 from graderd.api.tcp_guard import TOKEN_COOKIE
 from graderd.tokens import Right
@@ -38,7 +38,7 @@ def session_routes() -> APIRouter:
         """Send the token as `Authorization: Bearer TOKEN`. The cookie goes to this machine's own pages alone
         (`SameSite=Strict`), and no script can read it (`HttpOnly`)."""
         scheme, _, token = request.headers.get("authorization", "").partition(" ")
-        if request.client is None or request.client.host == "unix" or scheme.lower() != "bearer":
+        if is_local(request) or scheme.lower() != "bearer":
             raise ProblemError(409, "there is no token to keep", "session", "send 'Authorization: Bearer TOKEN' by TCP")
         response.set_cookie(
             TOKEN_COOKIE.decode(),
