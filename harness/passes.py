@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graderd.config import Config
+from graderd.config.tick import tick_settings
 from graderd.core import commands as cmd
 from graderd.core.attitude import MeasuredAttitude
 from graderd.core.axes import ACTUATORS
@@ -26,7 +27,6 @@ from graderd.hal.rotator import RotatorTelemetry
 from graderd.hal.vehicle import VehicleTelemetry
 from graderd.perception.classifier import make_classifier
 from graderd.runtime.app.sim import RIG_FRAME_AGE_S
-from graderd.runtime.control import tick_settings
 from graderd.simulator.camera.appearance import Appearance
 from graderd.simulator.camera.ground import SceneState
 from graderd.simulator.camera.materials import Materials

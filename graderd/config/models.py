@@ -71,11 +71,19 @@ class ApiSettings(Settings):
 
 
 class RecordingSettings(Settings):
-    """What is written down, and how much disk it may take."""
+    """What is recorded, and how much disk it may take. The black box (half a minute before and ten seconds after a
+    stop, a disarm, a fault or a mark) is always on."""
 
-    directory: str = Field("", description="empty: nothing is recorded")
-    rate_hz: Positive = Field(10.0, le=50)
-    max_mb: NotNegative = Field(500.0, description="oldest go first, incidents last")
+    directory: str = Field(
+        "", description="empty: recordings/ in $STATE_DIRECTORY as systemd gives it, else nothing is recorded"
+    )
+    runs: bool = Field(True, description="record every run; the black box goes on without")
+    pictures_hz: NotNegative = Field(1.0, le=10, description="annotated pictures a second, black box included")
+    raw: Literal["off", "reduced", "full"] = Field(
+        "off", description="raw frames with a run, by which perception can be judged again; much disk"
+    )
+    raw_every_n: int = Field(10, ge=2, le=1000, description="raw = reduced: one frame of so many")
+    max_mb: NotNegative = Field(2000.0, description="oldest runs go first, incidents last")
     min_free_mb: NotNegative = Field(200.0, description="recording pauses below this; control goes on")
 
 

@@ -265,6 +265,30 @@ def camera_json(calibration: CameraCalibration, blade: BladeGeometry, with_depth
     return {**blocks, "blade": blade.model_dump()}
 
 
+def with_lens_of(frame: Frame, calibration: CameraCalibration) -> CameraCalibration:
+    """The calibration's poses with the lens data the frame came with, where it has them."""
+
+    def lens(stream: StreamCalibration, told: Intrinsics | None) -> StreamCalibration:
+        if told is None:
+            return stream
+        changes = {
+            "width_px": told.width,
+            "height_px": told.height,
+            "fx_px": told.fx,
+            "fy_px": told.fy,
+            "cx_px": told.cx,
+            "cy_px": told.cy,
+            "distortion_n": told.coeffs,
+        }
+        return stream.model_copy(update=changes)
+
+    changes = {
+        "color": lens(calibration.color, frame.color_intrinsics),
+        "depth": lens(calibration.depth, frame.depth_intrinsics),
+    }
+    return calibration.model_copy(update=changes)
+
+
 class FrameSetWriter:
     """Writes a frame set as the frames come: a stopped run leaves a valid set behind."""
 

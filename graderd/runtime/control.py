@@ -9,12 +9,12 @@ from collections.abc import Callable
 from typing import Protocol
 
 from graderd.config import Config
+from graderd.config.tick import tick_settings
 from graderd.core import commands as cmd
 from graderd.core.attitude import MeasuredAttitude
 from graderd.core.machine import ARMED, Mode, State
-from graderd.core.plausibility import motion_figures
 from graderd.core.soil import SoilObservation
-from graderd.core.tick import NO_VEHICLE, AxisSensed, AxisTick, Controller, Sensed, Tick, TickSettings
+from graderd.core.tick import NO_VEHICLE, AxisSensed, AxisTick, Controller, Sensed, Tick
 from graderd.hal.clock import Clock
 from graderd.hal.errors import DeviceError
 from graderd.hal.fault import DeviceFault
@@ -44,25 +44,6 @@ class Eyes(Protocol):
         ...
 
 
-def tick_settings(config: Config) -> TickSettings:
-    """What the tick goes by, out of the configuration."""
-    figures = config.figures()
-    return TickSettings(
-        figures=figures,
-        motion=motion_figures(config.rotation, figures),
-        machine=config.machine,
-        rule=config.rule,
-        gate=config.gate,
-        lift_pair=config.lift_pair,
-        attitude=config.attitude,
-        presets=config.presets,
-        overrun_s=config.control.overrun_s,
-        max_frame_age_s=config.perception.decision.max_frame_age_s,
-        max_vehicle_age_s=config.vehicle.max_age_s,
-        no_auto=config.perception.why_not_to_drive(),
-    )
-
-
 def _state_at_start(last_stop: LastStop | None) -> State:
     """Stopped, where nobody has let go of what stopped the machine before it was started anew."""
     if last_stop is None or last_stop.reset:
@@ -76,6 +57,8 @@ class ControlLoop:
     those of every axis.
 
     ``fault_sources``: told the time, each says what it sees wrong now. ``on_tick``: called at the end of every tick.
+    ``on_step``: called with what every step of the controller knew and decided, those of a stop between two ticks
+    included; the wires have been told by then. ``controller`` and its ``settings`` are for the recorder to read.
     """
 
     def __init__(
@@ -90,10 +73,11 @@ class ControlLoop:
         self.last_stop = state_file.load()
         self.fault_sources: list[Callable[[float], tuple[DeviceFault, ...]]] = []
         self.on_tick: Callable[[], None] | None = None
+        self.on_step: Callable[[Sensed, Tick], None] | None = None
         self._period_s = 1.0 / config.control.tick_hz
-        settings = tick_settings(config)
-        self.figures = settings.figures
-        self._controller = Controller(settings, _state_at_start(self.last_stop))
+        self.settings = tick_settings(config)
+        self.figures = self.settings.figures
+        self.controller = Controller(self.settings, _state_at_start(self.last_stop))
         self._devices = devices
         self._eyes = eyes
         self._clock = clock
@@ -103,7 +87,7 @@ class ControlLoop:
         self._refused: dict[str, str] = {}
         self._keep_last_stop = False
         self.sensed = self._sensed(())
-        self.tick = self._controller.step(self.sensed)
+        self.tick = self.controller.step(self.sensed)
 
     # ---- commands -------------------------------------------------------------------------------------------------
 
@@ -163,9 +147,11 @@ class ControlLoop:
     def _step(self, commands: tuple[cmd.Command, ...], late_s: float = 0.0) -> tuple[cmd.Reply, ...]:
         before = self.tick.state
         self.sensed = self._sensed(commands, late_s)
-        self.tick = self._controller.step(self.sensed)
+        self.tick = self.controller.step(self.sensed)
         self._act(self.tick)  # the wires come first, then whoever wants to know
         self._note(before.mode, self.tick.state)
+        if self.on_step is not None:
+            self.on_step(self.sensed, self.tick)
         return self.tick.replies
 
     def _note(self, before: Mode, after: State) -> None:

@@ -1,8 +1,8 @@
 """What the daemon and its perception child say to each other: one JSON object a line, both ways.
 
 To the child: first a :class:`Start`, then ``Angle`` at the control rate, ``PreviewRequest`` when someone looks,
-``SaveFrame`` while calibrating. From the child: ``Opened``, ``Observed`` for every frame, ``CameraProblem``,
-``Preview``, ``Saved``.
+``SaveFrame`` while calibrating, ``RecordFrames`` where raw frames are recorded. From the child: ``Opened``,
+``Observed`` for every frame, ``CameraProblem``, ``Preview``, ``Saved``.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from graderd.core.blade import BladeGeometry
 from graderd.core.soil import SoilObservation
 from graderd.hal.settings import AnyCameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
+from graderd.record.layout import FramesWanted
 
 _OBSERVATION: TypeAdapter[SoilObservation] = TypeAdapter(SoilObservation)
 
@@ -66,6 +67,13 @@ class SaveFrame(_Message):
     folder: str
     id: str
     blade_angle_deg: float
+
+
+class RecordFrames(_Message):
+    """Record raw frames from now on as ``wanted`` says, or no more."""
+
+    kind: Literal["record_frames"] = "record_frames"
+    wanted: FramesWanted
 
 
 class Saved(_Message):
@@ -134,8 +142,8 @@ class Preview(_Message):
     jpeg_base64: str
 
 
-ToChild = TypeAdapter[Angle | PreviewRequest | SaveFrame](
-    Annotated[Angle | PreviewRequest | SaveFrame, Field(discriminator="kind")]
+ToChild = TypeAdapter[Angle | PreviewRequest | SaveFrame | RecordFrames](
+    Annotated[Angle | PreviewRequest | SaveFrame | RecordFrames, Field(discriminator="kind")]
 )
 FromChild = TypeAdapter[Opened | Observed | CameraProblem | Preview | Saved](
     Annotated[Opened | Observed | CameraProblem | Preview | Saved, Field(discriminator="kind")]

@@ -28,6 +28,7 @@ from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.reading import Reading
 from graderd.hal.settings import CameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
+from graderd.record.layout import FramesWanted
 from graderd.runtime.perception_protocol import (
     Angle,
     CameraProblem,
@@ -36,6 +37,7 @@ from graderd.runtime.perception_protocol import (
     Opened,
     Preview,
     PreviewRequest,
+    RecordFrames,
     Saved,
     SaveFrame,
     Start,
@@ -97,6 +99,7 @@ class PerceptionSupervisor:
         self._frame_times: deque[float] = deque(maxlen=30)
         self._preview: asyncio.Future[Reading[bytes]] | None = None
         self._saved: asyncio.Future[Saved] | None = None
+        self._frames = FramesWanted()
 
     @property
     def newest(self) -> SoilObservation | None:
@@ -194,6 +197,11 @@ class PerceptionSupervisor:
             raise DeviceTimeoutError("camera", f"no frame within {timeout_s:g} s", "See graderd status") from None
         if saved.problem:
             raise DeviceRefusedError("camera", f"the frame could not be saved: {saved.problem}")
+
+    def record_frames(self, wanted: FramesWanted) -> None:
+        """Have raw frames recorded from now on, or no more; a child that is started anew is told again."""
+        self._frames = wanted
+        self._write(RecordFrames(wanted=wanted))
 
     def _write(self, message: BaseModel) -> None:
         process = self._process
@@ -294,6 +302,8 @@ class PerceptionSupervisor:
             self._opened, self._problem = message, None
             self._opened_s = self._last_word_s
             log.info("camera open: %s", message.description, extra=_FIELDS)
+            if self._frames.path:
+                self._write(RecordFrames(wanted=self._frames))
         elif isinstance(message, CameraProblem):
             log.warning("camera: %s", message.message, extra={**_FIELDS, "fault": f"camera.{message.condition}"})
             self._problem = message

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from graderd.config import Config
+from graderd.config.tick import tick_settings
 from graderd.core import commands as cmd
 from graderd.core.attitude import Preset
 from graderd.core.axes import ACTUATORS, AXES, JOG_AXES, LIFTS, PARTS
@@ -28,7 +29,6 @@ from graderd.hal.fault import DeviceFault
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry
-from graderd.runtime.control import tick_settings
 
 TICKS_N = int(os.environ.get("GRADERD_MONITOR_TICKS", "20000"))
 RUN_N = 2000

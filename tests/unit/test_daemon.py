@@ -10,6 +10,8 @@ import signal
 import pytest
 
 from graderd.config import Config
+from graderd.core import commands as cmd
+from graderd.core.machine import Mode
 from graderd.hal.clock import SystemClock
 from graderd.runtime.app import daemon as daemon_module
 from graderd.runtime.app.daemon import ENDING_SIGNALS, Daemon, keep_running
@@ -78,13 +80,26 @@ async def test_what_is_told_after_a_tick_may_fail(
     fed: list[str] = []
     monkeypatch.setattr(daemon._notifier, "feed_watchdog", lambda: fed.append("watchdog"))
     monkeypatch.setattr(daemon._notifier, "status", lambda _: fed.append("status"))
-    for helper in (daemon._recorder, daemon._port, daemon._hang_watch):
-        for method in ("take", "published", "ticked"):
-            if hasattr(helper, method):
-                monkeypatch.setattr(helper, method, fail)
+    for helper, method in ((daemon._port, "published"), (daemon._hang_watch, "ticked")):
+        monkeypatch.setattr(helper, method, fail)
     daemon._after_tick()
     assert fed == ["watchdog", "status"]
-    assert sum(record.levelno == logging.ERROR for record in caplog.records) == 3
+    assert sum(record.levelno == logging.ERROR for record in caplog.records) == 2
+
+
+async def test_a_recorder_that_fails_ends_neither_a_tick_nor_a_stop(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    daemon = Daemon(Config(), None)
+
+    def fail(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(daemon._recorder, "take", fail)
+    daemon._loop.run_tick()
+    assert daemon._loop.stop_now(cmd.Stop(reason="enough")).accepted
+    assert daemon._loop.tick.state.mode is Mode.STOPPED
+    assert [record.message for record in caplog.records].count("recording a step failed") == 2
 
 
 async def test_a_control_loop_that_fails_holds_every_axis_first(monkeypatch: pytest.MonkeyPatch) -> None:

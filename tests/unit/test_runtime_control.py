@@ -330,7 +330,7 @@ async def test_a_stop_is_on_every_wire_before_anything_else_is_asked(
     """A mistake in what decides must not stand between the button and the wires."""
     await bench.arm()
     bench.machine.log.clear()
-    monkeypatch.setattr(bench.loop._controller, "step", lambda _: 1 / 0)
+    monkeypatch.setattr(bench.loop.controller, "step", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         bench.loop.stop_now(cmd.Stop(reason="person near"))
     assert bench.machine.log == ["rotation hold", "lift_left hold", "lift_right hold", "tilt hold"]

@@ -7,12 +7,12 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from graderd.config.tick import tick_settings
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Zone
 from graderd.hal.camera import Frame
 from graderd.perception import CameraCalibration, PerceptionSettings
 from graderd.perception.classifier import make_classifier
-from graderd.runtime.control import tick_settings
 from graderd.simulator.camera.appearance import Appearance
 from graderd.simulator.camera.ground import SceneState
 from graderd.simulator.camera.materials import materials_of

@@ -16,8 +16,10 @@ from graderd.api.server import serve
 from graderd.config import Config, ConfigError, load
 from graderd.core import commands as cmd
 from graderd.core.machine import Mode
+from graderd.core.tick import Sensed, Tick
 from graderd.hal.clock import SystemClock
 from graderd.hal.errors import DeviceError
+from graderd.record.recorder import Recorder
 from graderd.runtime.app.devices import build_devices, build_stop_input, problems
 from graderd.runtime.app.journal import set_up_logging
 from graderd.runtime.app.last_run import remember
@@ -28,7 +30,6 @@ from graderd.runtime.devices import open_devices
 from graderd.runtime.health import HangWatch, HealthWatch
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 from graderd.runtime.port import Port
-from graderd.runtime.recorder import Recorder
 from graderd.runtime.sd_notify import SystemdNotifier
 from graderd.runtime.state_file import StateFile
 
@@ -103,15 +104,19 @@ class Daemon:
         self._devices = build_devices(config, clock, on_bus_stop=self._stop_from_bus)
         self._state_file = StateFile(config.state.directory)
         self._loop = ControlLoop(config, self._devices, self._eyes, clock, self._state_file)
-        services = build_services(config, self._devices, self._loop, self._eyes)
+        self._recorder = Recorder(config, self._loop.settings, self._loop.controller, self._eyes)
+        services = build_services(config, self._devices, self._loop, self._eyes, self._recorder)
         self._port = Port(config, self._loop, self._devices, self._eyes, services)
-        self._recorder = Recorder(config)
         self._health = HealthWatch(config)
         self._loop.fault_sources += [self._recorder.faults, self._health.faults]
         self._stop_input = build_stop_input(config, clock, on_stop=self._stop_from_input)
         if self._stop_input is not None:
             self._loop.fault_sources.append(self._stop_input.faults)
         self._loop.on_tick = self._after_tick
+        self._loop.on_step = self._after_step
+        if self._recorder.directory is not None:
+            for name, watch in self._devices.buses.items():
+                watch(self._recorder.listen(name))
         self._status_line_due_s = 0.0
         self._ended = asyncio.Event()
 
@@ -129,7 +134,6 @@ class Daemon:
             lambda: self._hang_watch.ticked(tick.now_s),
             lambda: self._devices.publish_faults(tick.device_faults(), tick.state.mode is Mode.STOPPED),
             self._port.published,
-            lambda: self._recorder.take(tick.now_s, self._port.status),
         )
         for tell in tells:
             try:
@@ -139,6 +143,13 @@ class Daemon:
         if tick.now_s >= self._status_line_due_s:
             self._status_line_due_s = tick.now_s + STATUS_LINE_S
             self._notifier.status(f"{tick.state.mode}: {tick.state.reason}")
+
+    def _after_step(self, sensed: Sensed, tick: Tick) -> None:
+        """Runs in every step of the controller: what fails here may end neither a tick nor a stop."""
+        try:
+            self._recorder.take(sensed, tick)
+        except Exception:
+            log.exception("recording a step failed")
 
     async def run(self) -> None:
         """Run until a signal, then stop motion, close the devices in the configured order, and return."""

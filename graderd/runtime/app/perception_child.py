@@ -21,12 +21,13 @@ import cv2
 from pydantic import BaseModel, ValidationError
 
 from graderd.core.attitude import UNMEASURED, MeasuredAttitude
-from graderd.hal.camera import Camera, EndOfFrames, Frame, Intrinsics
+from graderd.hal.camera import Camera, EndOfFrames, Frame
 from graderd.hal.errors import DeviceError, DeviceTimeoutError
 from graderd.hal.settings import DEPTH_PRESETS, CameraSettings
 from graderd.perception.classifier import Classifier, judge_frame, make_classifier
-from graderd.perception.frame_set import Entry, FrameSetWriter
-from graderd.perception.settings import CameraCalibration, StreamCalibration
+from graderd.perception.frame_set import Entry, FrameSetWriter, with_lens_of
+from graderd.record.frames import FrameRecorder, Judged
+from graderd.record.layout import FramesWanted
 from graderd.runtime.app.frame_sources import open_camera
 from graderd.runtime.perception_protocol import (
     Angle,
@@ -34,6 +35,7 @@ from graderd.runtime.perception_protocol import (
     Observed,
     Opened,
     Preview,
+    RecordFrames,
     Saved,
     SaveFrame,
     Start,
@@ -86,6 +88,7 @@ class Worker:
         self._preview_wanted = threading.Event()
         self._to_save: queue.SimpleQueue[SaveFrame] = queue.SimpleQueue()
         self._writers: dict[str, FrameSetWriter] = {}
+        self._recorder: FrameRecorder | None = None
 
     def _send(self, message: BaseModel) -> None:
         self._out.write(message.model_dump_json().encode() + b"\n")
@@ -100,6 +103,8 @@ class Worker:
                 self._attitude = message.attitude
             elif isinstance(message, SaveFrame):
                 self._to_save.put(message)
+            elif isinstance(message, RecordFrames):
+                self._record(message.wanted)
             else:
                 self._preview_wanted.set()
         os._exit(0)
@@ -147,15 +152,26 @@ class Worker:
                 return 3
             angle_deg, age_s = self._angles.at(frame.capture_s)
             attitude = self._attitude
+            judged_s = time.monotonic()
             observation = judge_frame(
-                classifier, frame, angle_deg, age_s, time.monotonic(), self._start.perception.decision, attitude
+                classifier, frame, angle_deg, age_s, judged_s, self._start.perception.decision, attitude
             )
             self._send(Observed.of(observation))
+            if (recorder := self._recorder) is not None:
+                recorder.take(Judged(frame, angle_deg, age_s, attitude, judged_s, observation))
             if not self._to_save.empty():
                 self._save(self._to_save.get(), frame, attitude)
             if self._preview_wanted.is_set():
                 self._preview_wanted.clear()
                 self._send(Preview(capture_s=frame.capture_s, jpeg_base64=_jpeg(classifier, frame, observation)))
+
+    def _record(self, wanted: FramesWanted) -> None:
+        """On the thread that listens: files are begun and ended beside the judging."""
+        former, self._recorder = self._recorder, None
+        if former is not None:
+            former.end()
+        if wanted.path:
+            self._recorder = FrameRecorder(wanted)
 
     def _save(self, wanted: SaveFrame, frame: Frame, attitude: MeasuredAttitude) -> None:
         problem = ""
@@ -173,30 +189,6 @@ def _jpeg(classifier: Classifier, frame: Frame, observation: object) -> str:
     picture = classifier.annotate(frame, observation)  # type: ignore[arg-type]  # same observation as just made
     ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return base64.b64encode(data.tobytes()).decode() if ok else ""
-
-
-def with_lens_of(frame: Frame, calibration: CameraCalibration) -> CameraCalibration:
-    """The calibration's poses with the lens data the frame came with, where it has them."""
-
-    def lens(stream: StreamCalibration, told: Intrinsics | None) -> StreamCalibration:
-        if told is None:
-            return stream
-        changes = {
-            "width_px": told.width,
-            "height_px": told.height,
-            "fx_px": told.fx,
-            "fy_px": told.fy,
-            "cx_px": told.cx,
-            "cy_px": told.cy,
-            "distortion_n": told.coeffs,
-        }
-        return stream.model_copy(update=changes)
-
-    changes = {
-        "color": lens(calibration.color, frame.color_intrinsics),
-        "depth": lens(calibration.depth, frame.depth_intrinsics),
-    }
-    return calibration.model_copy(update=changes)
 
 
 def settings_not_kept(settings: CameraSettings, read_back: dict[str, float]) -> tuple[str, ...]:

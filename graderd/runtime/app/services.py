@@ -11,15 +11,17 @@ import tempfile
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
 from graderd.config import Config
-from graderd.hal.device import DeviceService
+from graderd.core.commands import ClientText
+from graderd.hal.device import DeviceService, NoArguments
 from graderd.hal.errors import CommandRangeError, DeviceMissingError, DeviceRefusedError
 from graderd.hal.rotator import Rotator
 from graderd.hal.settings import Finite, Positive, Settings
+from graderd.record.recorder import Recorder
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
 from graderd.runtime.maneuver import Maneuver
@@ -104,8 +106,21 @@ class CalibrationFrames:
             self._folder = None
 
 
+class MarkArguments(Settings):
+    """Arguments of ``recording.mark``."""
+
+    text: ClientText = Field(max_length=200)
+    client: ClientText = Field("", max_length=80)
+
+
+class StartArguments(Settings):
+    """Arguments of ``recording.start``."""
+
+    raw: Literal["off", "reduced", "full"] = "off"
+
+
 def build_services(
-    config: Config, devices: Devices, loop: ControlLoop, eyes: PerceptionSupervisor
+    config: Config, devices: Devices, loop: ControlLoop, eyes: PerceptionSupervisor, recorder: Recorder
 ) -> dict[str, DeviceService]:
     """The services by name."""
     frames = CalibrationFrames(config.state.directory)
@@ -122,6 +137,7 @@ def build_services(
 
     return {
         **devices.services,
+        **_recording(config, recorder),
         "rotation.step_response": DeviceService(
             step_response, moves=True, arguments=StepArguments, summary="Turn the blade by a step and back, and report"
         ),
@@ -137,6 +153,43 @@ def build_services(
             arguments=FileArguments,
             summary="A picture of the last calibration, once",
         ),
+    }
+
+
+def _recording(config: Config, recorder: Recorder) -> dict[str, DeviceService]:
+    """What clients may ask of the recorder; none of it touches the machine."""
+
+    def directory() -> str:
+        if recorder.directory is None:
+            raise DeviceMissingError("recording", "the daemon has no directory for it", "Set recording.directory")
+        return str(recorder.directory)
+
+    async def mark(wanted: MarkArguments) -> dict[str, Any]:
+        found = directory()
+        recorder.mark(wanted.text, wanted.client)
+        return {"marked": True, "directory": found}
+
+    async def start(wanted: StartArguments) -> dict[str, Any]:
+        found = directory()
+        recorder.start({"off": 0, "reduced": config.recording.raw_every_n, "full": 1}[wanted.raw])
+        return {"recording": True, "raw": wanted.raw, "directory": found}
+
+    async def stop(_: NoArguments) -> dict[str, Any]:
+        found = directory()
+        recorder.stop()
+        return {"recording": False, "directory": found}
+
+    return {
+        "recording.mark": DeviceService(
+            mark,
+            only_reads=True,
+            arguments=MarkArguments,
+            summary="Put a word into the recording and keep what is around",
+        ),
+        "recording.start": DeviceService(
+            start, only_reads=True, arguments=StartArguments, summary="Record the run from now on"
+        ),
+        "recording.stop": DeviceService(stop, only_reads=True, summary="Record runs no more; the black box stays on"),
     }
 
 

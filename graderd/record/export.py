@@ -1,0 +1,90 @@
+"""A recording as ordinary files: for spreadsheets, for the decoders of the wires, and its raw frames as a frame set."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TextIO
+
+from graderd.perception.frame_set import Entry, FrameSetWriter, with_lens_of
+from graderd.record.files import RecordingFile
+from graderd.record.frames import Judged, judged_of
+from graderd.record.layout import COLOR, DEPTH, FRAME, LOG, PREVIEW, WIRE, Message
+from graderd.record.reader import Recording, said
+from graderd.record.table import rows, write_csv
+
+WHOLE = "recording.mcap"
+
+
+def export(recording: Recording, folder: Path) -> dict[str, int]:
+    """Write everything that is in it to ``folder``; returns how much of each there was.
+
+    ``recording.mcap`` is the same recording with an end and a summary, which every reader opens, also where the
+    original was cut off.
+
+    Raises:
+        FileExistsError: the folder is there already.
+    """
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_bytes(recording.config_json)
+    found = {"ticks_n": write_csv(folder / "ticks.csv", rows(recording)), "pictures_n": 0, "log_lines_n": 0}
+    whole = RecordingFile(folder / WHOLE, recording.head, recording.config_json)
+    with ExitStack() as stack:
+        texts: dict[str, TextIO] = {}
+        for message in recording.messages():
+            whole.add(message)
+            if message.topic == PREVIEW:
+                picture = base64.b64decode(said(message)["data"])
+                path = folder / "pictures" / f"{message.log_ns}.jpg"
+                path.parent.mkdir(exist_ok=True)
+                path.write_bytes(picture)
+                found["pictures_n"] += 1
+            elif message.topic == LOG or message.topic.startswith(WIRE):
+                name = message.topic.rpartition("/")[2]
+                if name not in texts:
+                    texts[name] = stack.enter_context((folder / f"{name}.log").open("w", encoding="utf-8"))
+                lines = [_log_line(message)] if message.topic == LOG else said(message)["lines"]
+                texts[name].writelines(f"{line}\n" for line in lines)
+                found["log_lines_n"] += len(lines)
+    whole.finish()
+    if recording.frames_path.is_file():
+        found["frames_n"] = _export_frames(Recording(recording.frames_path), folder / "frames")
+    return found
+
+
+def _log_line(message: Message) -> str:
+    told = said(message)
+    return f"{message.log_ns / 1e9:.3f} {told['name']}: {told['message']}"
+
+
+def raw_frames(recording: Recording) -> Iterator[Judged]:
+    """The raw frames of a recording, whole ones only, oldest first."""
+    frame, color = b"", ""
+    waits_for_depth = False
+    for message in recording.messages((FRAME, COLOR, DEPTH)):
+        if message.topic == FRAME:
+            if waits_for_depth:
+                yield judged_of(frame, color, None)
+            frame, waits_for_depth = message.data, False
+        elif message.topic == COLOR:
+            color, waits_for_depth = said(message)["data"], True
+        elif waits_for_depth:
+            yield judged_of(frame, color, said(message)["data"])
+            waits_for_depth = False
+    if waits_for_depth:
+        yield judged_of(frame, color, None)
+
+
+def _export_frames(recording: Recording, folder: Path) -> int:
+    """As a frame set, for ``graderd classify`` and ``graderd label``."""
+    writer, count_n = None, 0
+    for judged in raw_frames(recording):
+        frame = judged.frame
+        if writer is None:
+            calibration = with_lens_of(frame, recording.config.camera.calibration)
+            writer = FrameSetWriter(folder, calibration, recording.config.blade)
+        writer.add(Entry(f"{count_n:05d}", None, judged.angle_deg, attitude=judged.attitude), frame)
+        count_n += 1
+    return count_n

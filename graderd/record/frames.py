@@ -1,0 +1,185 @@
+"""Raw frames to a recording of their own, beside the run's: written by the perception child, which has them.
+
+Colour and depth are PNG, bit for bit what the classifier saw; with each frame goes everything it was judged by.
+"""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import queue
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from graderd.core.attitude import MeasuredAttitude
+from graderd.core.soil import SoilObservation
+from graderd.hal.camera import Frame
+from graderd.record.files import RecordingFile
+from graderd.record.layout import (
+    COLOR,
+    DEPTH,
+    FRAME,
+    FRAMES_SUFFIX,
+    MARK,
+    FrameRecord,
+    FramesWanted,
+    Mark,
+    Message,
+    frame_bytes,
+    frame_of,
+    image_message,
+)
+
+WAITING_N = 4
+"""Frames that wait to be written; what comes beyond is left out, and counted."""
+FLUSH_S = 0.5
+_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+
+
+class Judged(NamedTuple):
+    """One frame, what it was judged by, and what came of it."""
+
+    frame: Frame
+    angle_deg: float
+    angle_age_s: float
+    attitude: MeasuredAttitude
+    judged_s: float
+    observation: SoilObservation
+
+
+class FrameRecorder:
+    """Writes one of ``every_n`` frames, on a thread of its own. :meth:`take` never waits."""
+
+    def __init__(self, wanted: FramesWanted) -> None:
+        self._wanted = wanted
+        self._frames: queue.Queue[Judged | None] = queue.Queue(WAITING_N)
+        self._seen_n = 0
+        self._lost_n = 0
+        self._thread = threading.Thread(target=self._work, name="frame-recorder", daemon=True)
+        self._thread.start()
+
+    def take(self, judged: Judged) -> None:
+        """One more frame was judged."""
+        self._seen_n += 1
+        if self._seen_n % self._wanted.every_n:
+            return
+        try:
+            self._frames.put_nowait(judged)
+        except queue.Full:
+            self._lost_n += 1
+
+    def end(self) -> None:
+        """Take no more; what waits is written, and the file is ended."""
+        threading.Thread(target=self._frames.put, args=(None,), daemon=True).start()
+
+    def join(self, most_s: float) -> None:
+        """Wait for the end of the file after :meth:`end`."""
+        self._thread.join(most_s)
+
+    def _work(self) -> None:
+        try:
+            self._write_all()
+        except OSError as error:
+            sys.stderr.write(f"raw frames are no longer recorded: {error.filename or ''} {error.strerror}\n")
+            while self._frames.get() is not None:
+                pass
+
+    def _write_all(self) -> None:
+        file = RecordingFile(_free(Path(self._wanted.path)), self._wanted.head, self._wanted.config_json.encode())
+        offset_ns = time.time_ns() - time.monotonic_ns()
+        due_s, lost_n = 0.0, 0
+        while (judged := self._frames.get()) is not None:
+            if self._lost_n > lost_n:
+                mark = Mark(kind="lost", lost_n=self._lost_n - lost_n, text="frames came faster than they were written")
+                lost_n = self._lost_n
+                file.add(Message(MARK, int(judged.judged_s * 1e9) + offset_ns, mark.model_dump_json().encode()))
+            for message in messages_of(judged, self._wanted.every_n, offset_ns):
+                file.add(message)
+            if (now_s := time.monotonic()) >= due_s:
+                due_s = now_s + FLUSH_S
+                file.flush()
+        file.finish()
+
+
+def _free(path: Path) -> Path:
+    """``path``, or a name beside it: a child that was started anew goes on in a file of its own."""
+    stem = path.name.removesuffix(FRAMES_SUFFIX)
+    names = itertools.chain([path], (path.with_name(f"{stem}-{n}{FRAMES_SUFFIX}") for n in itertools.count(2)))
+    return next(name for name in names if not name.exists())
+
+
+def messages_of(judged: Judged, every_n: int, offset_ns: int) -> list[Message]:
+    """Circumstances, colour and depth; ``offset_ns``: of the wall clock on the monotonic one."""
+    frame, attitude = judged.frame, judged.attitude
+    at_ns = int(frame.capture_s * 1e9) + offset_ns
+    record = FrameRecord(
+        capture_s=frame.capture_s,
+        judged_s=judged.judged_s,
+        angle_deg=judged.angle_deg,
+        angle_age_s=judged.angle_age_s,
+        observation=judged.observation,
+        every_n=every_n,
+        color_number=frame.color_number,
+        depth_number=frame.depth_number,
+        height_mm=attitude.height_mm,
+        slope_deg=attitude.slope_deg,
+        pitch_deg=attitude.pitch_deg,
+        color_intrinsics=frame.color_intrinsics,
+        depth_intrinsics=frame.depth_intrinsics,
+        metadata=frame.metadata,
+    )
+    found = [Message(FRAME, at_ns, frame_bytes(record)), image_message(COLOR, at_ns, _png(frame.color_bgr), "png")]
+    if frame.depth_mm is not None:
+        found.append(image_message(DEPTH, at_ns, _png(frame.depth_mm), "png"))
+    return found
+
+
+def _png(picture: Any) -> str:
+    ok, data = cv2.imencode(".png", picture, _PNG)
+    if not ok:
+        raise ValueError("a picture that is none")
+    return base64.b64encode(data.tobytes()).decode()
+
+
+def picture_of(data_base64: str) -> Any:
+    """The picture of an image message, as it was: BGR, or 16-bit depth.
+
+    Raises:
+        ValueError: it is no picture.
+    """
+    picture = cv2.imdecode(np.frombuffer(base64.b64decode(data_base64), np.uint8), cv2.IMREAD_UNCHANGED)
+    if picture is None:
+        raise ValueError("not a readable picture")
+    return picture
+
+
+def judged_of(frame: bytes, color_base64: str, depth_base64: str | None) -> Judged:
+    """A recorded frame as it was judged.
+
+    Raises:
+        ValueError: a part of it is damaged.
+    """
+    record = frame_of(frame)
+    return Judged(
+        Frame(
+            color_bgr=picture_of(color_base64),
+            depth_mm=None if depth_base64 is None else picture_of(depth_base64),
+            color_intrinsics=record.color_intrinsics,
+            depth_intrinsics=record.depth_intrinsics,
+            capture_s=record.capture_s,
+            color_number=record.color_number,
+            depth_number=record.depth_number,
+            metadata=record.metadata,
+        ),
+        record.angle_deg,
+        record.angle_age_s,
+        MeasuredAttitude(record.height_mm, record.slope_deg, record.pitch_deg),
+        record.judged_s,
+        record.observation,
+    )

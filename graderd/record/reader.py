@@ -1,0 +1,143 @@
+"""Recordings read back: whole ones, those that a killed process left, and those still being written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from mcap.reader import make_reader
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Metadata
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader, breakup_chunk
+from pydantic import ValidationError
+
+from graderd.config import Config, ConfigError
+from graderd.config.loader import explain
+from graderd.hal.errors import DeviceMissingError, ProtocolError
+from graderd.record.layout import CONFIG, FRAMES_SUFFIX, METADATA, SUFFIX, Message
+
+RECORD_MOST_BYTES = 256 << 20
+"""A longer record is damage."""
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """What a file holds: nanoseconds of its first and last message, messages by channel (None where it was not counted:
+    the file has no summary), and whether it was ended in order."""
+
+    first_ns: int | None
+    last_ns: int | None
+    messages_n: int | None
+    is_ended: bool
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last message."""
+        return 0.0 if self.first_ns is None or self.last_ns is None else (self.last_ns - self.first_ns) / 1e9
+
+
+class Recording:
+    """One file, opened for reading: its head is read at once, messages when asked for.
+
+    Raises:
+        DeviceMissingError: no such file.
+        ProtocolError: it is no recording of graderd's.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if not path.is_file():
+            raise DeviceMissingError(str(path), "no such recording", "graderd record list shows which there are")
+        self.head: Mapping[str, str] = {}
+        self.config_json = b""
+        for record in self._records():
+            if isinstance(record, Metadata) and record.name == METADATA:
+                self.head = record.metadata
+            elif isinstance(record, Attachment) and record.name == CONFIG:
+                self.config_json = record.data
+            elif isinstance(record, Chunk):
+                break
+            if self.head and self.config_json:
+                break
+        if not self.head or not self.config_json:
+            raise ProtocolError(str(path), "is no recording of graderd's, or broke off before it began")
+
+    @cached_property
+    def config(self) -> Config:
+        """The configuration it was made with.
+
+        Raises:
+            ConfigError: today's graderd does not take it any more.
+        """
+        try:
+            return Config.model_validate_json(self.config_json)
+        except ValidationError as error:
+            raise ConfigError(self.path, explain(error, Config, where=f"{self.path} {CONFIG}")) from None
+
+    @cached_property
+    def extent(self) -> Extent:
+        """How much it holds, by its summary where there is one."""
+        try:
+            with self.path.open("rb") as file:
+                summary = make_reader(file).get_summary()
+        except Exception:  # whatever the library makes of a file without an end
+            summary = None
+        if summary is not None and summary.statistics is not None and summary.statistics.message_count:
+            told = summary.statistics
+            return Extent(told.message_start_time, told.message_end_time, told.message_count, True)
+        chunks = [record for record in self._records() if isinstance(record, Chunk)]
+        if chunks and not _inside(chunks[-1]):
+            chunks.pop()
+        if not chunks:
+            return Extent(None, None, 0, summary is not None)
+        first_ns = min(chunk.message_start_time for chunk in chunks)
+        return Extent(first_ns, max(chunk.message_end_time for chunk in chunks), None, summary is not None)
+
+    @property
+    def frames_path(self) -> Path:
+        """Where its raw frames lie, if there are any."""
+        return self.path.with_name(self.path.name.removesuffix(SUFFIX) + FRAMES_SUFFIX)
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
+        """In the file's order, up to its last whole chunk; ``topics`` None: of all channels."""
+        names: dict[int, str] = {}
+        for record in self._records():
+            if not isinstance(record, Chunk):
+                continue
+            for inner in _inside(record):
+                if isinstance(inner, Channel):
+                    names[inner.id] = inner.topic
+                elif isinstance(inner, McapMessage):
+                    topic = names[inner.channel_id]
+                    if topics is None or topic in topics:
+                        yield Message(topic, inner.log_time, inner.data)
+
+    def _records(self) -> Iterator[Any]:
+        """Records up to the end or the first damage: a file that is being written ends anywhere, also in its last
+        chunk."""
+        with self.path.open("rb") as file:
+            try:
+                for record in StreamReader(file, emit_chunks=True, record_size_limit=RECORD_MOST_BYTES).records:
+                    if isinstance(record, DataEnd | Footer):
+                        return
+                    yield record
+            except Exception:  # the library has no one error for a record that is cut off or damaged
+                return
+
+
+def _inside(chunk: Chunk) -> list[Any]:
+    """What is in a chunk; nothing where it is not whole."""
+    try:
+        return list(breakup_chunk(chunk, validate_crc=True))
+    except Exception:  # as above
+        return []
+
+
+def said(message: Message) -> dict[str, Any]:
+    """A message's JSON."""
+    found: dict[str, Any] = json.loads(message.data)
+    return found

@@ -1,0 +1,107 @@
+"""A recorder that is fed as the daemon feeds it, without a machine: for tests and benchmarks of recordings.
+
+``python -m harness.recording FOLDER`` records at 50 Hz until it is killed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from graderd.config import parse
+from graderd.core.tick import Controller, Sensed
+from graderd.hal.reading import Reading
+from graderd.record.layout import TICK, FramesWanted
+from graderd.record.reader import Recording, said
+from graderd.record.recorder import Recorder
+from harness.stretch import SETTINGS, TICK_S, stretch_of_work
+
+CAN_LINES_N, SERVO_LINES_N = 4, 6
+"""A tick, as on the simulated grader."""
+
+
+class NoEyes:
+    """Perception that has no pictures."""
+
+    def __init__(self) -> None:
+        self.told: list[FramesWanted] = []
+
+    async def preview_jpeg(self) -> Reading[bytes]:
+        raise TimeoutError
+
+    def record_frames(self, wanted: FramesWanted) -> None:
+        self.told.append(wanted)
+
+
+class Feed:
+    """A controller that goes over a stretch of work again and again, and its recorder."""
+
+    def __init__(self, directory: Path) -> None:
+        config = parse({"recording": {"directory": str(directory), "min_free_mb": 0}})
+        self._controller = Controller(SETTINGS)
+        self.recorder = Recorder(config, SETTINGS, self._controller, NoEyes())
+        self._work = itertools.cycle([replace(sensed, commands=()) for sensed in stretch_of_work()])
+        self._hear = {name: self.recorder.listen(name) for name in ("can", "servo")}
+        self.now_s = time.monotonic()
+
+    def tick(self, recording: bool = True) -> None:
+        """One tick, now."""
+        self.now_s = time.monotonic()
+        sensed: Sensed = replace(next(self._work), now_s=self.now_s)
+        tick = self._controller.step(sensed)
+        if recording:
+            for name, count_n in (("can", CAN_LINES_N), ("servo", SERVO_LINES_N)):
+                for _ in range(count_n):
+                    self._hear[name](f"({self.now_s:.6f}) {name} tx FFFFFD00010D0002220174000C00F5B3")
+            self.recorder.take(sensed, tick)
+
+    async def ticks(self, seconds: float, recording: bool = True) -> list[float]:
+        """Tick at 50 Hz for so long; how late each was, in milliseconds."""
+        due_s, late_ms = time.monotonic(), []
+        for _ in range(round(seconds / TICK_S)):
+            late_ms.append(max(0.0, time.monotonic() - due_s) * 1e3)
+            self.tick(recording)
+            due_s = max(due_s + TICK_S, time.monotonic())
+            await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+        return late_ms
+
+
+def record_until_killed(folder: Path, after_s: float) -> float:
+    """Have another process record into ``folder``, kill it after so long, and return how much its file lacks, seconds.
+
+    Raises:
+        AssertionError: it left no file that reads.
+    """
+    command = [sys.executable, "-m", "harness.recording", str(folder)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()  # it ticks
+        time.sleep(after_s)
+        killed_s = time.monotonic()
+        process.send_signal(signal.SIGKILL)
+    (path,) = folder.glob("*.mcap")
+    ticks = list(Recording(path).messages((TICK,)))
+    assert ticks, "nothing was kept"
+    return max(0.0, killed_s - float(said(ticks[-1])["now_s"]))
+
+
+async def _record(folder: Path) -> None:
+    feed = Feed(folder)
+    task = asyncio.create_task(feed.recorder.run())
+    feed.tick()
+    sys.stdout.write("ticking\n")
+    sys.stdout.flush()
+    while True:
+        await feed.ticks(1.0)
+        if task.done():
+            return
+
+
+if __name__ == "__main__":
+    asyncio.run(_record(Path(sys.argv[1])))
