@@ -148,6 +148,9 @@ async def _machine(directory: Path, show: Show) -> AsyncIterator[AsyncClient]:
                 stdout=log_file,
                 stderr=log_file,
                 env=environment,
+                # As the rig and its camera: Linux shares its processors among sessions first (sched_autogroup), so that
+                # what else this terminal does leaves each of them its part. And Ctrl-C is ours alone to pass on.
+                start_new_session=True,
             )
         show.event("starting", what="daemon")
         try:

@@ -44,6 +44,7 @@ class CameraChild:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=(self._descriptor,),
+            start_new_session=True,  # its pictures take most of the processor: not the rig's part of it
         )
         if not await self._says("ready", _START_S):
             raise DeviceLostError("rig camera", "its process did not start", "See its message above")
