@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -89,6 +90,26 @@ class _Stream:
         return _Machine(depth[band], normals[band], paint[band])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """A scene as it was looked at, and what it looks like without the imagers' noise."""
+
+    state: SceneState
+    appearance: Appearance
+    color: ColorImage
+    depth_m: Image32 | None
+
+    def is_of(self, state: SceneState, appearance: Appearance) -> bool:
+        """Whether it looks like this one."""
+        mine = self.state
+        return (
+            appearance == self.appearance
+            and (state.cell_m, state.vehicle_x_m, state.blade, state.props)
+            == (mine.cell_m, mine.vehicle_x_m, mine.blade, mine.props)
+            and np.array_equal(state.heights_m, mine.heights_m)
+        )
+
+
 class Renderer:
     """Renders colour and depth as a D455 between the front wheels would.
 
@@ -110,6 +131,7 @@ class Renderer:
         self._rng = np.random.default_rng(seed + 1)
         self._color = _Stream(COLOR_INTRINSICS.scaled(*color_size), color_pose)
         self._depth = _Stream(DEPTH_INTRINSICS.scaled(*depth_size), depth_pose) if depth_size else None
+        self._seen: _Seen | None = None
 
     @property
     def color_intrinsics(self) -> Intrinsics:
@@ -123,15 +145,26 @@ class Renderer:
 
     def render(self, state: SceneState, appearance: Appearance) -> tuple[ColorImage, DepthImage | None]:
         """Colour (BGR) and depth (uint16 millimetres, 0 = none) of one instant."""
-        ground = ground_map(state, appearance, self.materials)
-        color = self._render_color(state, appearance, ground)
-        return color, self._render_depth(state, appearance, ground) if self._depth else None
+        seen = self._look(state, appearance)
+        color = self._with_noise(seen.color, appearance)
+        return color, self._measured(seen.depth_m, appearance) if seen.depth_m is not None else None
 
     def render_depth_m(self, state: SceneState, appearance: Appearance) -> Image32:
         """Depth without any noise, metres; for tests and calibration."""
         if self._depth is None:
             raise ValueError("this renderer has no depth stream")
         return self._true_depth(state, ground_map(state, appearance, self.materials))
+
+    def _look(self, state: SceneState, appearance: Appearance) -> _Seen:
+        """What the scene looks like; one in which nothing changed since the last picture looks as it did."""
+        if self._seen is None or not self._seen.is_of(state, appearance):
+            ground = ground_map(state, appearance, self.materials)
+            color = self._render_color(state, appearance, ground)
+            depth_m = self._true_depth(state, ground) if self._depth else None
+            # Whoever made the state may go on with its heights.
+            kept = replace(state, heights_m=state.heights_m.copy())
+            self._seen = _Seen(kept, appearance, color, depth_m)
+        return self._seen
 
     # -- colour -----------------------------------------------------------------------------------------------------
 
@@ -226,17 +259,19 @@ class Renderer:
         return np.clip(lit, 0.0, 255.0).astype(np.uint8)
 
     def _develop(self, picture: Image8, appearance: Appearance) -> ColorImage:
-        """What the colour imager makes of it: lens blur, exposure, colour cast and noise."""
-        height, width = picture.shape[:2]
+        """What the colour imager makes of it, but for its noise: lens blur, exposure, colour cast."""
         picture = np.asarray(cv2.GaussianBlur(picture, (3, 3), 0.6))
         gain = np.array((1.0 - 0.5 * appearance.red_cast, 1.0, 1.0 + appearance.red_cast)) * appearance.exposure
         steps = np.arange(256, dtype=np.float32)[:, None]
         curve = np.clip(255.0 * (steps * gain / 255.0) ** 0.95, 0.0, 255.0)
-        picture = np.asarray(cv2.LUT(picture, curve.astype(np.uint8)[:, None, :]))
-        if appearance.color_noise > 0.0:
-            tile = self._noise_tile(height, width) * np.float32(appearance.color_noise)
-            picture = np.asarray(cv2.add(picture, cv2.merge((tile, tile, tile)), dtype=cv2.CV_8U))
-        return picture.astype(np.uint8, copy=False)
+        return np.asarray(cv2.LUT(picture, curve.astype(np.uint8)[:, None, :]), np.uint8)
+
+    def _with_noise(self, picture: ColorImage, appearance: Appearance) -> ColorImage:
+        """A picture of its own with another draw of the imager's noise."""
+        if appearance.color_noise <= 0.0:
+            return picture.copy()
+        tile = self._noise_tile(*picture.shape[:2]) * np.float32(appearance.color_noise)
+        return np.asarray(cv2.add(picture, cv2.merge((tile, tile, tile)), dtype=cv2.CV_8U), np.uint8)
 
     def _noise_tile(self, height: int, width: int) -> Image32:
         """A new cut out of one large noise field."""
@@ -265,11 +300,10 @@ class Renderer:
             _merge_depth(depth, hit)
         return depth
 
-    def _render_depth(self, state: SceneState, appearance: Appearance, ground: GroundMap) -> DepthImage:
+    def _measured(self, depth_m: Image32, appearance: Appearance) -> DepthImage:
         assert self._depth is not None
-        depth = self._true_depth(state, ground)
         return self.materials.stereo.measure(
-            depth, self._depth.intrinsics.fx, appearance.disparity_noise_px, appearance.hole_share, self._rng
+            depth_m, self._depth.intrinsics.fx, appearance.disparity_noise_px, appearance.hole_share, self._rng
         )
 
 

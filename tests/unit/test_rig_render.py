@@ -9,8 +9,9 @@ import numpy.typing as npt
 import pytest
 
 from graderd.hal.camera import Intrinsics, StreamPose
+from graderd.simulator.camera import renderer as rendering
 from graderd.simulator.camera.appearance import Appearance
-from graderd.simulator.camera.ground import SceneState
+from graderd.simulator.camera.ground import GroundMap, SceneState, ground_map
 from graderd.simulator.camera.materials import Materials, materials_of
 from graderd.simulator.camera.optics import (
     COLOR_INTRINSICS,
@@ -242,6 +243,50 @@ def test_rig_soil_texture_stays_on_the_ground(materials: Materials) -> None:
             moved.append(far[round(v), round(u)])
     assert len(seen) > 50
     assert np.corrcoef(seen, moved)[0, 1] > 0.6
+
+
+def test_rig_an_unchanged_scene_is_looked_at_once_and_has_new_noise(
+    materials: Materials, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[SceneState] = []
+
+    def look(state: SceneState, appearance: Appearance, textures: Materials) -> GroundMap:
+        looked.append(state)
+        return ground_map(state, appearance, textures)
+
+    monkeypatch.setattr(rendering, "ground_map", look)
+    renderer = Renderer(COLOR_SIZE, DEPTH_SIZE, materials=materials)
+    field, light = SoilField(), Appearance(ground="earth")
+    heights = field.heights_m.astype(np.float32)
+    first, again = (renderer.render(SceneState(heights, field.cell_m, 3.0, BladePose()), light) for _ in range(2))
+    assert len(looked) == 1
+    assert first[1] is not None
+    assert again[1] is not None
+    assert (first[0] != again[0]).mean() > 0.3
+    assert (first[1] != again[1]).mean() > 0.3
+    heights[300:310] += 0.05  # by whoever made the state, in place
+    box = Solid("box", (0.3, 0.0, 0.1), (0.05, 0.05, 0.05), (0, 0, 255))
+    for number, (x_m, blade, props, shone) in enumerate(
+        (
+            (3.0, BladePose(), (), light),
+            (3.01, BladePose(), (), light),
+            (3.01, BladePose(0.1), (), light),
+            (3.01, BladePose(0.1), (box,), light),
+            (3.01, BladePose(0.1), (box,), Appearance(exposure=2.0)),
+        ),
+        start=2,
+    ):
+        color, depth = renderer.render(SceneState(heights, field.cell_m, x_m, blade, props), shone)
+        assert len(looked) == number
+        afresh = Renderer(COLOR_SIZE, DEPTH_SIZE, materials=materials)
+        for _ in range(number):
+            afresh.render(SceneState(heights, field.cell_m, 1.0, blade), light)  # as many draws of noise
+        true_color, true_depth = afresh.render(SceneState(heights, field.cell_m, x_m, blade, props), shone)
+        assert np.array_equal(color, true_color)
+        assert depth is not None
+        assert true_depth is not None
+        assert np.array_equal(depth, true_depth)
+        del looked[number:]
 
 
 @pytest.mark.parametrize("height_m", [0.0, 0.3, 0.54, 0.56, 1.5])

@@ -18,7 +18,7 @@ from graderd.drivers.simulated.vehicle import SimulatedVehicle
 from graderd.hal.clock import SystemClock
 from graderd.hal.settings import CanSettings, VehicleSettings
 from graderd.hal.vehicle import VehicleTelemetry
-from graderd.runtime.app.sim import RIG_FRAME_AGE_S, attach
+from graderd.runtime.app.sim import RIG_FRAME_AGE_S, RIG_STREAMS, attach
 from graderd.simulator.control_client import RigControl
 from graderd.simulator.demo import CONFIG as DEMONSTRATION
 from graderd.simulator.process import Rig
@@ -194,6 +194,16 @@ def test_a_daemon_with_a_rig_hears_the_rigs_wheels_unless_told_otherwise(tmp_pat
     assert attach(Config(), tmp_path).vehicle == VehicleSettings(source="simulated", path="k")
     on_bus = Config(vehicle=VehicleSettings(source="j1939", address_n=3))
     assert attach(on_bus, tmp_path).vehicle == on_bus.vehicle
+
+
+def test_a_rig_renders_no_more_than_it_can_in_time_and_less_where_less_is_asked_for(tmp_path: Path) -> None:
+    names = {"servo": "s", "can": {"interface": "slcan", "channel": "c"}, "camera": "p", "control": "k"}
+    (tmp_path / "rig.json").write_text(json.dumps({"pid": 1, "stop_input": "t", **names}))
+    most = attach(Config(), tmp_path).camera
+    assert {name: getattr(most, name) for name in RIG_STREAMS} == RIG_STREAMS
+    less = {"color_width_px": 320, "color_height_px": 200, "depth_width_px": 0, "depth_height_px": 0, "rate_hz": 5.0}
+    asked = attach(parse({"camera": less}), tmp_path).camera
+    assert {name: getattr(asked, name) for name in less} == less
 
 
 def test_a_rigs_picture_may_be_older_and_older_still_where_the_configuration_says_so(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ RIG_STREAMS = {
     "depth_height_px": 240,
     "rate_hz": 15.0,
 }
-"""What the rig renders in time on one core beside everything else."""
+"""The most that the rig renders in time on one core beside everything else; who configured less gets less."""
 
 log = logging.getLogger(__name__)
 
@@ -148,7 +148,10 @@ def attach(config: Config, directory: Path) -> Config:
             str(path), f"no rig is ready there ({error})", "Start one: graderd rig --dir DIR"
         ) from None
     plays_files = config.camera.source not in ("realsense", "rig")
-    camera = {} if plays_files else {"source": "rig", "path": rig["camera"], **RIG_STREAMS}
+    camera: dict[str, Any] = {}
+    if not plays_files:
+        streams = {name: min(getattr(config.camera, name), most) for name, most in RIG_STREAMS.items()}
+        camera = {"source": "rig", "path": rig["camera"], **streams}
     age_s = max(config.perception.decision.max_frame_age_s, RIG_FRAME_AGE_S)
     decision = config.perception.decision.model_copy(update={"max_frame_age_s": age_s})
     changes = {
