@@ -21,7 +21,7 @@ from graderd.perception.color import fast_color_verdict, paper_verdict
 from graderd.perception.decide import Verdict, fuse
 from graderd.perception.depth import DepthJudge, HeightMap
 from graderd.perception.geometry import CENTER, LEFT, RIGHT, U8, Region, View, blade_region, image_thirds
-from graderd.perception.health import DepthWatch, HealthMonitor, obstructed
+from graderd.perception.health import HealthMonitor, NowAndThen, obstructed
 from graderd.perception.registration import Stance
 from graderd.perception.settings import (
     CameraCalibration,
@@ -99,7 +99,7 @@ class SoilClassifier:
         self._judges: dict[Intrinsics, DepthJudge] = {}
         self._regions: OrderedDict[tuple[object, ...], Region | None] = OrderedDict()
         # Stills have nothing to do with each other, and a look at one in ten says nothing about the next.
-        self._watch = DepthWatch() if live else None
+        self._watch = NowAndThen() if live else None
 
     @property
     def settings(self) -> PerceptionSettings:

@@ -50,6 +50,25 @@ BLUR_RANK = 0.7
 """The sharper rows count: a picture is blurred where all of it is, and shade or an even floor has no detail."""
 
 
+CHECK_EVERY_N = 10
+"""At 30 frames a second, three times a second."""
+
+
+class NowAndThen:
+    """Looks now and then at what decides nothing by itself, a frame of :data:`CHECK_EVERY_N`."""
+
+    def __init__(self) -> None:
+        self._frame_n = 0
+        self._faults: list[PictureFault] = []
+
+    def check(self, judge: Callable[[], list[PictureFault]]) -> list[PictureFault]:
+        """The faults that it found last; ``judge`` is called only when it is time to."""
+        if self._frame_n % CHECK_EVERY_N == 0:
+            self._faults = judge()
+        self._frame_n += 1
+        return list(self._faults)
+
+
 class HealthMonitor:
     """Judges pictures one after the other; one instance per stream of frames."""
 
@@ -63,18 +82,22 @@ class HealthMonitor:
         self._last_sample: bytes = b""
         self._last_size: tuple[int, ...] = ()
         self._same_n = 0
+        self._light_watch = NowAndThen()
+        self._blur_watch = NowAndThen()
+        self._is_watched = False
         self.lit = True
         """Whether the newest colour picture shows enough to be judged as a picture."""
 
     def check(self, frame: Frame, needs_depth: bool, needs_color: bool) -> list[PictureFault]:
         """What is wrong with the picture as such, before anything is measured in it.
 
-        Depth brings its own light: where colour is not needed, its darkness or glare is no fault.
+        Depth brings its own light: where colour is not needed, its darkness or glare is no fault, and light and blur
+        of a live stream are looked at now and then.
         """
         faults = self._size(frame)
         sample = np.ascontiguousarray(frame.color_bgr[:: SAMPLE_STEP_PX[0], :: SAMPLE_STEP_PX[1]])
-        self.lit = True
-        light = self._light(sample)
+        self.lit, self._is_watched = True, self._live and not needs_color
+        light = self._light_watch.check(lambda: self._light(sample)) if self._is_watched else self._light(sample)
         if not needs_color and light and light[0].condition in ("black", "blown_out"):
             self.lit, light = False, []
         faults += light
@@ -163,7 +186,15 @@ class HealthMonitor:
         return []
 
     def blurred(self, image_bgr: U8, region: Region) -> list[PictureFault]:
-        """Fine against coarse contrast on rows of the blade's region: a blurred picture has only coarse contrast."""
+        """Fine against coarse contrast on rows of the blade's region: a blurred picture has only coarse contrast.
+
+        To be asked after :meth:`check`.
+        """
+        if self._is_watched:
+            return self._blur_watch.check(lambda: self._blurred(image_bgr, region))
+        return self._blurred(image_bgr, region)
+
+    def _blurred(self, image_bgr: U8, region: Region) -> list[PictureFault]:
         ratio = sharpness_ratio(image_bgr, region)
         if ratio < self._settings.blurred_ratio:
             detail = f"fine contrast is {ratio:.2f} of the coarse, at least {self._settings.blurred_ratio:.2f}"
@@ -262,22 +293,3 @@ def obstructed(soil: HeightMap) -> list[PictureFault]:
     side = "left" if s > 0 else "right"
     detail = f"something stands {d * 100:.0f} cm ahead of the blade, {abs(s) * 100:.0f} cm {side} of its middle"
     return [PictureFault("obstructed", detail)]
-
-
-CHECK_EVERY_N = 10
-"""At 30 frames a second the depth picture is looked at three times a second."""
-
-
-class DepthWatch:
-    """Looks now and then at the depth picture under a colour method; one instance per stream of frames."""
-
-    def __init__(self) -> None:
-        self._frame_n = 0
-        self._faults: list[PictureFault] = []
-
-    def check(self, judge: Callable[[], list[PictureFault]]) -> list[PictureFault]:
-        """The faults that it found last; ``judge`` is called only when it is time to."""
-        if self._frame_n % CHECK_EVERY_N == 0:
-            self._faults = judge()
-        self._frame_n += 1
-        return list(self._faults)

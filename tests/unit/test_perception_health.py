@@ -17,6 +17,7 @@ from graderd.hal.camera import Frame
 from graderd.hal.settings import CameraSettings
 from graderd.perception import METHODS, CameraCalibration, Method, PerceptionSettings
 from graderd.perception.classifier import Classifier, make_classifier
+from graderd.perception.health import CHECK_EVERY_N
 from graderd.simulator.camera.appearance import Appearance
 from graderd.simulator.camera.ground import SceneState
 from graderd.simulator.camera.renderer import Renderer
@@ -93,6 +94,19 @@ def test_depth_needs_no_light(how: str, zone: Zone) -> None:
     unlit = judge(spoiled(frame, how), "depth")
     assert unlit.zone is zone
     assert unlit.volume_left_l == judge(frame, "depth").volume_left_l
+
+
+@pytest.mark.parametrize("how", ["blocked", "blurred"])
+def test_a_colour_picture_that_depth_does_not_need_is_looked_at_three_times_a_second(how: str) -> None:
+    classifier = make_classifier(PerceptionSettings(method="depth"), CameraCalibration(), BladeGeometry())
+    good, bad = picture(), spoiled(picture(), how)
+    said = []
+    for number in range(2 * CHECK_EVERY_N + 1):
+        still = bad if 1 <= number <= CHECK_EVERY_N else good
+        color = still.color_bgr.copy()
+        color[0, 0] = number  # or it would be frozen
+        said.append(named(classifier.classify(replace(still, color_bgr=color), ANGLE_DEG, 0.0)))
+    assert said == [[]] * CHECK_EVERY_N + [[how]] * CHECK_EVERY_N + [[]]
 
 
 @pytest.mark.parametrize("how", ["no depth", "hardly any depth"])
