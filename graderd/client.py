@@ -59,8 +59,8 @@ STOP_SUFFIX: Final = ".stop"
 """Beside the interface's socket ``graderd.sock``, ``graderd.stop`` serves nothing but stop."""
 STOP_PATH: Final = "/v1/stop"
 STOP_LANE_S: Final = 0.5
-"""On TCP the port after the interface's serves nothing but stop (``api.tcp.stop_port_n`` may name another). Where it
-does not answer in so long, the interface is asked."""
+"""On TCP, a port that serves nothing but stop is asked first where the program names it. Where it does not answer in so
+long, the interface is asked."""
 TIMEOUT_S: Final = 5.0
 SERVICE_TIMEOUT_S: Final = 120.0
 LEASE_HZ: Final = 10.0
@@ -101,6 +101,10 @@ class ClientError(Exception):
 
 class NoDaemonError(ClientError):
     """Nobody answers at this address, or not in time, or what answers is not graderd."""
+
+
+class _ClosedError(NoDaemonError):
+    """A connection ended under way. Where a lease was on it, that is over too."""
 
 
 class RefusedError(ClientError):
@@ -191,6 +195,9 @@ class Client:
         address: path of the unix socket, or ``http://HOST:PORT`` (``https://`` by the system's certificate
             authorities, or those of ``$SSL_CERT_FILE``); None: :func:`default_socket`.
         token: one that ``graderd token create`` made, on TCP.
+        stop_port_n: on TCP, the port of the same host that serves stop alone (the daemon's ``api.tcp.stop_port_n``,
+            8432 as it comes). None: a stop goes to the interface like everything else. It is never guessed: what
+            listens on another port may be anybody's, and would be handed the token.
         name: who asks, for the daemon's records; None: the user.
         timeout_s: how long to wait for an answer.
 
@@ -207,8 +214,9 @@ class Client:
         token: str = "",
         name: str | None = None,
         timeout_s: float = TIMEOUT_S,
+        stop_port_n: int | None = None,
     ) -> None:
-        self._address = _Address.of(address, token)
+        self._address = _Address.of(address, token, stop_port_n)
         self.name = (user_name() if name is None else name)[:80]
         self.timeout_s = timeout_s
 
@@ -318,13 +326,16 @@ class Client:
         Raises:
             RefusedError: refused, failed, or ended under way.
         """
+        from websockets.exceptions import ConnectionClosed
+
         give_up_s = time.monotonic() + timeout_s
         with self._websocket(f"/v1/services/{quote(name)}") as connection:
             connection.send(json.dumps(arguments, allow_nan=False))
             while time.monotonic() < give_up_s:
                 with suppress(TimeoutError):
                     return _result_of(name, connection.recv(1.0 / LEASE_HZ))
-                connection.send(RENEWAL)
+                with suppress(ConnectionClosed):  # its last word has come meanwhile, and is read next
+                    connection.send(RENEWAL)
         raise self._address.unreachable(TimeoutError(), went_out=True)
 
     @contextmanager
@@ -443,12 +454,12 @@ class Lease:
         """
         try:
             self._ask({"command": "renew"})
-        except RefusedError as error:
-            raise _lease_lost(self._motion, self._client.get("/v1/status")) from error
+        except (RefusedError, _ClosedError) as error:
+            raise self._lost(error) from error
 
     def release(self) -> None:
         """Hold where the blade is, and give the lease back. A lease that has ended already is no error."""
-        with suppress(RefusedError):
+        with suppress(RefusedError, _ClosedError):
             self._ask({"command": "release"})
 
     def statuses(self) -> Iterator[Status]:
@@ -464,9 +475,20 @@ class Lease:
         return iter(self._step, None)
 
     def _step(self) -> dict[str, Any]:
-        status = self._newest.take()
+        try:
+            status = self._newest.take()
+        except _ClosedError as error:
+            raise self._lost(error) from error
         self.renew()
         return status
+
+    def _lost(self, error: ClientError) -> ClientError:
+        """Why there is no lease any more: the daemon knows, if it is still there. One that stood still for long
+        (halted, asleep) finds its connections closed, too."""
+        try:
+            return _lease_lost(self._motion, self._client.get("/v1/status"))
+        except NoDaemonError:
+            return error
 
     def _begin(self, message: dict[str, Any]) -> None:
         self._motion = message["command"]
@@ -501,9 +523,10 @@ class AsyncClient:
         token: str = "",
         name: str | None = None,
         timeout_s: float = TIMEOUT_S,
+        stop_port_n: int | None = None,
     ) -> None:
-        self._waiting = Client(address, token=token, name=name, timeout_s=timeout_s)
-        self._address = _Address.of(address, token)
+        self._waiting = Client(address, token=token, name=name, timeout_s=timeout_s, stop_port_n=stop_port_n)
+        self._address = _Address.of(address, token, stop_port_n)
         self.name = self._waiting.name
         self.timeout_s = timeout_s
 
@@ -588,6 +611,8 @@ class AsyncClient:
 
     async def maneuver(self, name: str, timeout_s: float = SERVICE_TIMEOUT_S, **arguments: Any) -> dict[str, Any]:
         """See :meth:`Client.maneuver`; it ends, too, when this is cancelled."""
+        from websockets.exceptions import ConnectionClosed
+
         try:
             async with asyncio.timeout(timeout_s), self._websocket(f"/v1/services/{quote(name)}") as connection:
                 await connection.send(json.dumps(arguments, allow_nan=False))
@@ -595,7 +620,8 @@ class AsyncClient:
                     with suppress(TimeoutError):
                         async with asyncio.timeout(1.0 / LEASE_HZ):
                             return _result_of(name, await connection.recv())
-                    await connection.send(RENEWAL)
+                    with suppress(ConnectionClosed):
+                        await connection.send(RENEWAL)
         except TimeoutError as error:
             raise self._address.unreachable(error, went_out=True) from error
 
@@ -667,12 +693,12 @@ class AsyncLease:
         """See :meth:`Lease.renew`."""
         try:
             await self._ask({"command": "renew"})
-        except RefusedError as error:
-            raise _lease_lost(self._motion, await self._client.get("/v1/status")) from error
+        except (RefusedError, _ClosedError) as error:
+            raise await self._lost(error) from error
 
     async def release(self) -> None:
         """See :meth:`Lease.release`."""
-        with suppress(RefusedError):
+        with suppress(RefusedError, _ClosedError):
             await self._ask({"command": "release"})
 
     def statuses(self) -> AsyncIterator[Status]:
@@ -680,9 +706,19 @@ class AsyncLease:
         return _Each(self._step)
 
     async def _step(self) -> Status:
-        status = await self._newest.take()
+        try:
+            status = await self._newest.take()
+        except _ClosedError as error:
+            raise await self._lost(error) from error
         await self.renew()
         return self._address.status_of(status)
+
+    async def _lost(self, error: ClientError) -> ClientError:
+        """See :meth:`Lease._lost`."""
+        try:
+            return _lease_lost(self._motion, await self._client.get("/v1/status"))
+        except NoDaemonError:
+            return error
 
     async def _begin(self, message: dict[str, Any]) -> None:
         self._motion = message["command"]
@@ -716,15 +752,16 @@ class _Address:
     port_n: int
     token: str
     tls: bool = False
+    stop_port_n: int | None = None
 
     @classmethod
-    def of(cls, address: Path | str | None, token: str) -> _Address:
+    def of(cls, address: Path | str | None, token: str, stop_port_n: int | None) -> _Address:
         if isinstance(address, str) and "://" in address:
             parts = urlsplit(address)
             if parts.scheme not in ("http", "https") or not parts.hostname or parts.path.strip("/"):
                 raise ValueError(f"{address}: the daemon speaks http://HOST:PORT, and with a certificate https://")
             tls = parts.scheme == "https"
-            return cls(None, parts.hostname, parts.port or (443 if tls else 80), token, tls)
+            return cls(None, parts.hostname, parts.port or (443 if tls else 80), token, tls, stop_port_n)
         return cls(default_socket() if address is None else Path(address), "localhost", 80, token)
 
     def __str__(self) -> str:
@@ -744,11 +781,11 @@ class _Address:
         return f"ws{'s' * self.tls}://{self.netloc}{path}{'?' if query else ''}{urlencode(query)}"
 
     def http_connection(self, timeout_s: float, stop_lane: bool = False) -> http.client.HTTPConnection:
-        """``stop_lane``: where stop alone is served, and nobody else waits; an older daemon has none."""
+        """``stop_lane``: where stop alone is served, and nobody else waits, if there is such a place."""
         if self.path is None:
             connection = http.client.HTTPSConnection if self.tls else http.client.HTTPConnection
-            if stop_lane and 0 < self.port_n < 65535:
-                return connection(self.host, self.port_n + 1, timeout=min(timeout_s, STOP_LANE_S))
+            if stop_lane and self.stop_port_n is not None:
+                return connection(self.host, self.stop_port_n, timeout=min(timeout_s, STOP_LANE_S))
             return connection(self.host, self.port_n, timeout=timeout_s)
         stop_socket = self.path.with_suffix(STOP_SUFFIX)
         if stop_lane and _is_socket(stop_socket):
@@ -804,7 +841,7 @@ class _Address:
         return NoDaemonError(where, f"the daemon cannot be reached: {error}", "see its log", may_be_done=went_out)
 
     def closed(self) -> NoDaemonError:
-        return NoDaemonError(str(self), "the daemon closed the connection", "see graderd status")
+        return _ClosedError(str(self), "the daemon closed the connection", "see graderd status")
 
 
 class _UnixConnection(http.client.HTTPConnection):

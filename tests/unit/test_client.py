@@ -7,12 +7,14 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Awaitable, Callable, Iterator
-from contextlib import AsyncExitStack, contextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from websockets.asyncio import client as async_client
+from websockets.sync import client as sync_client
 
 from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.client import (
@@ -123,6 +125,88 @@ async def test_a_program_that_hangs_loses_its_lease_and_is_told_why(tmp_path: Pa
         assert daemon.positions["rotation"] < 45.0
 
 
+@asynccontextmanager
+async def go_between(path: Path, to: Path) -> AsyncIterator[set[asyncio.StreamWriter]]:
+    """A way to the daemon whose connections can be broken: those that are open now."""
+    ways: set[asyncio.StreamWriter] = set()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        far_reader, far_writer = await asyncio.open_unix_connection(str(to))
+        ways.update((writer, far_writer))
+
+        async def carry(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+            with suppress(OSError):
+                while piece := await source.read(65536):
+                    sink.write(piece)
+                    await sink.drain()
+            sink.close()
+
+        await asyncio.gather(carry(reader, far_writer), carry(far_reader, writer))
+        ways.difference_update((writer, far_writer))
+
+    async with await asyncio.start_unix_server(serve, path):
+        yield ways
+
+
+async def test_who_finds_his_connections_closed_is_told_what_became_of_his_lease(tmp_path: Path) -> None:
+    """As a program that was halted for long: its lease lapsed, and then the daemon closed what answers no ping."""
+    between = tmp_path / "between.sock"
+
+    async def lapsed(jog: Awaitable[None]) -> None:
+        await jog
+        await daemon.until(lambda: daemon.state.lease is None)
+        for way in list(ways):
+            way.transport.abort()
+        await daemon.until(lambda: not ways)
+
+    async with serving(tmp_path) as (daemon, path), go_between(between, path) as ways:
+        async with AsyncClient(path) as client:
+            await client.command("arm")
+            await client.until(lambda status: status.mode is Mode.MANUAL, 5.0, "armed")
+        async with AsyncClient(between) as client, client.lease() as lease:
+            await lapsed(lease.jog("rotate", 60.0))
+            with pytest.raises(LeaseLostError, match=r"^jog: ended on the way: manual, lease of .* lapsed"):
+                await anext(lease.statuses())
+        block = Client(between).lease()
+        waiting = await in_thread(block.__enter__)
+        await lapsed(in_thread(lambda: waiting.jog("rotate", 60.0)))
+        with pytest.raises(LeaseLostError, match=r"^jog: ended on the way: manual, lease of .* lapsed"):
+            await in_thread(lambda: next(waiting.statuses()))
+        await in_thread(lambda: block.__exit__(None, None, None))
+
+
+async def test_who_was_halted_in_a_maneuver_is_told_that_it_was_not_heard(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It wakes, and wants to renew, when the daemon has said its last word and closed."""
+    halted = [True, True]
+    waiting_recv, loop_recv = sync_client.ClientConnection.recv, async_client.ClientConnection.recv
+
+    def recv(self: sync_client.ClientConnection, timeout: float | None = None) -> str | bytes:
+        if halted.pop():
+            self.recv_events_thread.join(10.0)
+            raise TimeoutError
+        return waiting_recv(self, timeout)
+
+    async def recv_on_a_loop(self: async_client.ClientConnection) -> str | bytes:
+        if halted.pop():
+            await self.wait_closed()
+            raise TimeoutError
+        return await loop_recv(self)
+
+    monkeypatch.setattr(sync_client.ClientConnection, "recv", recv)
+    monkeypatch.setattr(async_client.ClientConnection, "recv", recv_on_a_loop)
+    monkeypatch.setattr("graderd.client.LEASE_HZ", 0.1)  # ten seconds, in which it does not look
+    async with serving(tmp_path) as (daemon, path):
+        halted[:] = [False, True]
+        with pytest.raises(RefusedError, match=r"was not heard for 0\.5 s"):
+            await in_thread(lambda: Client(path).maneuver("rotation.step_response", consent=True))
+        halted[:] = [False, True]
+        with pytest.raises(RefusedError, match=r"was not heard for 0\.5 s"):
+            await AsyncClient(path).maneuver("rotation.step_response", consent=True)
+        await daemon.until(lambda: daemon.maneuvers == ["began", "ended"] * 2)
+
+
 async def test_the_status_taken_is_the_newest_however_slowly_they_are_taken(tmp_path: Path) -> None:
     async with serving(tmp_path) as (daemon, path), AsyncClient(path) as client, client.statuses(20.0) as statuses:
         first = await anext(statuses)
@@ -158,8 +242,9 @@ async def test_a_control_tick_that_does_not_answer_leaves_it_open_whether_it_was
     assert unanswered.value.may_be_done
 
 
-@pytest.mark.parametrize("lane", ["serves stops", "hangs", "is a stranger's", "is not there"])
-async def test_a_stop_over_tcp_takes_its_own_port_and_else_the_interfaces(lane: str) -> None:
+@pytest.mark.parametrize("lane", ["serves stops", "hangs", "is a stranger's", "is not there", "was not named"])
+async def test_a_stop_over_tcp_takes_the_port_that_was_named_for_it_and_else_the_interfaces(lane: str) -> None:
+    """Nobody who was not named hears of the token, also on the port where the daemon serves stop if told nothing."""
     heard: list[str] = []
 
     def server(name: str, answer: bytes) -> Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]:
@@ -179,6 +264,7 @@ async def test_a_stop_over_tcp_takes_its_own_port_and_else_the_interfaces(lane: 
         "serves stops": stopped,
         "hangs": b"",
         "is a stranger's": b"HTTP/1.1 404 No\r\ncontent-length: 0\r\n\r\n",
+        "was not named": stopped,
     }
     port_n, sockets = _two_ports()
     async with AsyncExitStack() as stack:
@@ -187,8 +273,9 @@ async def test_a_stop_over_tcp_takes_its_own_port_and_else_the_interfaces(lane: 
             await stack.enter_async_context(await asyncio.start_server(server("lane", answers[lane]), sock=sockets[1]))
         else:
             sockets[1].close()
-        assert (await AsyncClient(f"http://127.0.0.1:{port_n}", token="t").stop()).accepted
-    expected = {"serves stops": ["lane"], "is not there": ["interface"]}
+        named_n = None if lane == "was not named" else port_n + 1
+        assert (await AsyncClient(f"http://127.0.0.1:{port_n}", token="t", stop_port_n=named_n).stop()).accepted
+    expected = {"serves stops": ["lane"], "is not there": ["interface"], "was not named": ["interface"]}
     assert heard == expected.get(lane, ["lane", "interface"])
 
 
