@@ -156,7 +156,10 @@ class FakeActuator(FakeAxis):
     LOST = "no_feedback"
 
     def telemetry(self) -> ActuatorTelemetry:
-        return ActuatorTelemetry(position_mm=self.reading(), target_sent_mm=self.sent, goal_mm=self.goal)
+        at, flags = self.reading(), frozenset[str]()
+        return ActuatorTelemetry(
+            position_mm=at, flags=Reading(flags, at.time_s), target_sent_mm=self.sent, goal_mm=self.goal
+        )
 
     def set_target_mm(self, target_mm: float, speed_share: float = 1.0) -> None:
         if not 0.0 < speed_share <= 1.0:

@@ -129,9 +129,15 @@ def _soil(status: Status) -> Table:
     for name in ("left", "center", "right"):
         share = getattr(soil, f"share_{name}")
         litres = getattr(soil, f"volume_{name}_l")
-        bar = "█" * round(share * BAR_N)
+        bar = "█" * round((share or 0.0) * BAR_N)
         style = "bold green" if soil.zone == name else "yellow"
-        bars.append(Text(f"{bar or '·'}\n{share:4.0%}" + (f"  {litres:.1f} l" if litres is not None else ""), style))
+        bars.append(
+            Text(
+                f"{bar or '·'}\n{'?' if share is None else f'{share:4.0%}'}"
+                + (f"  {litres:.1f} l" if litres is not None else ""),
+                style,
+            )
+        )
     table.add_row(*bars)
     age = f"{soil.age_s * 1e3:.0f} ms old, {soil.frames_per_s:.0f} frames/s" if soil.age_s is not None else "no picture"
     table.caption = (
@@ -155,7 +161,7 @@ def _axes(status: Status) -> Table:
 
 
 def _axis_state(axis: AxisStatus) -> str:
-    moving = "moving" if axis.moving else "at rest"
+    moving = "?" if axis.moving is None else "moving" if axis.moving else "at rest"
     return f"{axis.lifecycle}, {moving}" + (f", {', '.join(axis.flags)}" if axis.flags else "")
 
 

@@ -23,6 +23,7 @@ from graderd.client import Client
 from graderd.hal.text import printable
 
 THERMAL_SHOWN = 0.05
+THIRDS = ("left", "center", "right")
 Section = tuple[str, Row, list[Row]]
 
 
@@ -123,7 +124,7 @@ def sections(state: dict[str, Any]) -> list[Section]:
 
 def _axis(axis: dict[str, Any]) -> Row:
     unit = axis["unit"]
-    notes = [axis["limited_because"], *axis["flags"]]
+    notes = [axis["limited_because"], *(axis["flags"] or ())]
     if axis["moving"]:
         notes.append("moving")
     if (axis["thermal_load"] or 0.0) >= THERMAL_SHOWN:
@@ -143,9 +144,10 @@ def _axis(axis: dict[str, Any]) -> Row:
 
 
 def _soil(soil: dict[str, Any]) -> str:
-    shares = f"left {soil['share_left']:.0%}, center {soil['share_center']:.0%}, right {soil['share_right']:.0%}"
-    age = _number(soil["age_s"], "s old", 2)
-    return f"{soil['zone']} ({soil['confidence']:.0%} sure; {shares}; {age}; {soil['reason']})"
+    thirds = [f"{third} {soil[f'share_{third}']:.0%}" for third in THIRDS if soil[f"share_{third}"] is not None]
+    sure = f"{soil['confidence']:.0%} sure"
+    said = [sure, *([", ".join(thirds)] if thirds else []), _number(soil["age_s"], "s old", 2), soil["reason"]]
+    return f"{soil['zone']} ({'; '.join(said)})"
 
 
 def _told_apart(soil: dict[str, Any]) -> list[Row]:

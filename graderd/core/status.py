@@ -1,4 +1,8 @@
-"""What the daemon tells its clients: one model for HTTP, WebSocket, CLI, page and records. Units are in the names."""
+"""What the daemon tells its clients: one model for HTTP, WebSocket, CLI, page and records. Units are in the names.
+
+What was measured is null where it is not known, or no more, and its age stands beside it; everything else is of the
+tick at ``time_s``.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,9 @@ class AxisStatus(_Status):
     """One axis, in degrees (rotation) or millimetres: requested, limited, sent and measured are all visible.
 
     ``arrived``: it stands where it was asked to go, within its tolerance. What was measured is None once it is older
-    than control would act on; what changes slowly (voltage, temperature, torque, flags), once it is older than 5 s.
-    ``measured_age_s`` goes on telling how old the last position is."""
+    than control would act on; what changes slowly (voltage, temperature, torque, flags, thermal load), once it is older
+    than 5 s. ``ages_s``: how old each measured value is, and what was ``sent``, by its name; none for what is None.
+    ``measured_age_s`` goes on telling how old the last position is. ``flags``: the device's own that are set."""
 
     name: str
     unit: str
@@ -40,16 +45,20 @@ class AxisStatus(_Status):
     in_position: bool | None = None
     torque_on: bool | None = None
     thermal_load: float | None = None
-    flags: tuple[str, ...] = ()
+    flags: tuple[str, ...] | None = None
+    ages_s: dict[str, float] = {}
     counters: dict[str, int] = {}
 
 
 class AttitudeStatus(_Status):
-    """Blade attitude from the actuators' extensions; None where an extension is not known."""
+    """Blade attitude from the actuators' extensions; None where an extension is not known. ``lifts_age_s``: of the
+    older of the two that height and slope come from."""
 
     height_mm: float | None = None
     slope_deg: float | None = None
+    lifts_age_s: float | None = None
     pitch_deg: float | None = None
+    pitch_age_s: float | None = None
 
 
 class ThirdsStatus(_Status):
@@ -70,16 +79,17 @@ class AheadStatus(ThirdsStatus):
 
 class SoilStatus(_Status):
     """The newest observation of the soil: all that lies in front of the blade, and told apart what lies ahead and what
-    it carries; these two are null where the method has no depth. Once its picture is too old, ``zone`` is unknown, and
-    so is the rest."""
+    it carries; these two, and the litres, are null where the method has no depth. Once its picture is too old, ``zone``
+    is unknown, and so is the rest: where ``zone`` is unknown no share is told. ``age_s`` is of the picture that all of
+    it is from."""
 
     zone: Zone = Zone.UNKNOWN
     confidence: float = 0.0
     reason: str = "no picture yet"
     age_s: float | None = None
-    share_left: float = 0.0
-    share_center: float = 0.0
-    share_right: float = 0.0
+    share_left: float | None = None
+    share_center: float | None = None
+    share_right: float | None = None
     volume_left_l: float | None = None
     volume_center_l: float | None = None
     volume_right_l: float | None = None
@@ -104,11 +114,12 @@ class DecisionStatus(_Status):
 
 
 class VehicleStatus(_Status):
-    """How the machine drives, as far as it says."""
+    """How the machine drives, as far as it says; ``age_s``: of the speed."""
 
     speed_m_per_s: float | None = None
-    travelled_m: float | None = None
     age_s: float | None = None
+    travelled_m: float | None = None
+    travelled_age_s: float | None = None
 
 
 class FaultStatus(_Status):
@@ -142,17 +153,19 @@ class LeaseStatus(_Status):
 
 
 class CameraStatus(_Status):
-    """The perception worker and its camera."""
+    """The perception worker and its camera. ``settings_read_back``: what the camera itself said it was set to, when it
+    was opened last, ``settings_age_s`` ago."""
 
     lifecycle: Lifecycle = Lifecycle.CLOSED
     description: str = ""
     restarts_n: int = 0
     recovery: str = ""
     settings_read_back: dict[str, float] = {}
+    settings_age_s: float | None = None
 
 
 class TickStatus(_Status):
-    """Health of the control tick."""
+    """Health of the control tick; ``lateness_p99_ms``: of the last 500."""
 
     rate_hz: float = 0.0
     overruns_n: int = 0

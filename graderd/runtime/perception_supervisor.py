@@ -143,6 +143,7 @@ class PerceptionSupervisor:
             restarts_n=self._restarts_n,
             recovery=recovery,
             settings_read_back=self._opened.settings_read_back if self._opened else {},
+            settings_age_s=self._clock.now_s() - self._opened_s if self._opened else None,
         )
 
     def faults(self) -> tuple[DeviceFault, ...]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from functools import lru_cache
 from importlib.metadata import version
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 from graderd.config import Config
-from graderd.core.axes import UNITS
+from graderd.core.attitude import MeasuredAttitude
+from graderd.core.axes import LIFTS, UNITS
 from graderd.core.readiness import Requirement
-from graderd.core.soil import SoilAhead, SoilObservation, Thirds
+from graderd.core.soil import SoilAhead, SoilObservation, Thirds, Zone
 from graderd.core.status import (
     AheadStatus,
     AttitudeStatus,
@@ -25,7 +28,7 @@ from graderd.core.status import (
     TickStatus,
     VehicleStatus,
 )
-from graderd.core.tick import AxisSensed, AxisTick
+from graderd.core.tick import AxisSensed, AxisTick, Sensed
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry
@@ -33,7 +36,6 @@ from graderd.hal.vehicle import VehicleTelemetry
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 
-T = TypeVar("T")
 VEHICLE_MAX_AGE_S = 1.0
 """How the machine drives is unknown when nobody has told it for so long."""
 VERSION = version("graderd")
@@ -70,9 +72,7 @@ def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) 
             name: _axis(name, told, tick.axes[name], now_s, loop.figures[name].max_age_s)
             for name, told in sensed.axes.items()
         },
-        attitude=AttitudeStatus(
-            height_mm=tick.attitude.height_mm, slope_deg=tick.attitude.slope_deg, pitch_deg=tick.attitude.pitch_deg
-        ),
+        attitude=_attitude(tick.attitude, sensed, now_s),
         faults=tuple(
             FaultStatus(
                 name=f.name,
@@ -114,9 +114,7 @@ def _soil(newest: SoilObservation | None, frames_per_s: float, now_s: float) -> 
         confidence=newest.confidence,
         reason=newest.reason,
         age_s=max(0.0, now_s - newest.capture_s),
-        share_left=newest.share_left,
-        share_center=newest.share_center,
-        share_right=newest.share_right,
+        **({} if newest.zone is Zone.UNKNOWN else _shares(newest)),
         volume_left_l=newest.volume_left_l,
         volume_center_l=newest.volume_center_l,
         volume_right_l=newest.volume_right_l,
@@ -127,6 +125,14 @@ def _soil(newest: SoilObservation | None, frames_per_s: float, now_s: float) -> 
         frames_per_s=frames_per_s,
         method=newest.method,
     )
+
+
+def _shares(newest: SoilObservation) -> dict[str, Any]:
+    return {
+        "share_left": newest.share_left,
+        "share_center": newest.share_center,
+        "share_right": newest.share_right,
+    }
 
 
 def _ahead(ahead: SoilAhead) -> AheadStatus:
@@ -140,8 +146,22 @@ def _litres(thirds: Thirds) -> dict[str, float]:
 def _vehicle(told: VehicleTelemetry, now_s: float) -> VehicleStatus:
     return VehicleStatus(
         speed_m_per_s=_moving(told.speed_m_per_s, now_s),
-        travelled_m=_moving(told.travelled_m, now_s),
         age_s=told.speed_m_per_s.age_s(now_s) if told.speed_m_per_s else None,
+        travelled_m=_moving(told.travelled_m, now_s),
+        travelled_age_s=told.travelled_m.age_s(now_s) if told.travelled_m else None,
+    )
+
+
+def _attitude(attitude: MeasuredAttitude, sensed: Sensed, now_s: float) -> AttitudeStatus:
+    ages_s = {
+        axis: told.telemetry.position.age_s(now_s) for axis, told in sensed.axes.items() if told.telemetry.position
+    }
+    return AttitudeStatus(
+        height_mm=attitude.height_mm,
+        slope_deg=attitude.slope_deg,
+        lifts_age_s=None if attitude.height_mm is None else max(ages_s[axis] for axis in LIFTS),
+        pitch_deg=attitude.pitch_deg,
+        pitch_age_s=None if attitude.pitch_deg is None else ages_s["tilt"],
     )
 
 
@@ -151,15 +171,11 @@ def _moving(reading: Reading[float] | None, now_s: float) -> float | None:
 
 def _axis(name: str, axis: AxisSensed, decided: AxisTick, now_s: float, max_age_s: float) -> AxisStatus:
     told = axis.telemetry
-
-    def fresh(reading: Reading[T] | None) -> T | None:
-        """What control may act on, and nothing older: past its age it is unknown."""
-        return reading.value if reading is not None and reading.is_fresh(now_s, max_age_s) else None
-
-    def known(reading: Reading[T] | None) -> T | None:
-        """What changes slowly and is asked for seldom."""
-        return reading.value if reading is not None and reading.is_fresh(now_s, KNOWN_FOR_S) else None
-
+    values: dict[str, Any] = {}
+    ages_s: dict[str, float] = {}
+    for field, reading, valid_for_s in _readings(told, max_age_s):
+        if reading is not None and reading.is_fresh(now_s, valid_for_s):
+            values[field], ages_s[field] = reading.value, reading.age_s(now_s)
     return AxisStatus(
         name=name,
         unit=UNITS[name],
@@ -168,41 +184,34 @@ def _axis(name: str, axis: AxisSensed, decided: AxisTick, now_s: float, max_age_
         limited=decided.limited,
         limited_because=decided.because,
         arrived=decided.arrived,
-        measured=fresh(told.position),
         measured_age_s=told.position.age_s(now_s) if told.position else None,
-        current_a=fresh(told.current_a),
-        moving=fresh(told.moving),
+        ages_s=ages_s,
         counters=told.counters,
-        **(_rotator(told, fresh, known) if isinstance(told, RotatorTelemetry) else _actuator(told, fresh, known)),
+        **values,
     )
 
 
-class _Known(Protocol):
-    def __call__(self, reading: Reading[T] | None) -> T | None: ...
-
-
-def _rotator(told: RotatorTelemetry, fresh: _Known, known: _Known) -> dict[str, Any]:
-    return {
-        "sent": _sent(told.goal_sent_deg),
-        "velocity_per_s": fresh(told.velocity_deg_per_s),
-        "torque_nm": fresh(told.torque_nm),
-        "voltage_v": known(told.voltage_v),
-        "temperature_c": known(told.temperature_c),
-        "in_position": fresh(told.in_position),
-        "torque_on": known(told.torque_on),
-    }
-
-
-def _actuator(told: ActuatorTelemetry, fresh: _Known, known: _Known) -> dict[str, Any]:
-    return {
-        "sent": _sent(told.target_sent_mm),
-        "velocity_per_s": fresh(told.velocity_mm_per_s),
-        "duty_percent": fresh(told.duty_percent),
-        "thermal_load": told.thermal_load,
-        "flags": tuple(sorted(known(told.flags) or ())),
-    }
-
-
-def _sent(reading: Reading[float] | None) -> float | None:
-    """What its driver was told last stays so, however long ago."""
-    return reading.value if reading is not None and reading.valid else None
+def _readings(
+    told: RotatorTelemetry | ActuatorTelemetry, max_age_s: float
+) -> Iterator[tuple[str, Reading[Any] | None, float]]:
+    """Each field of the status, its reading, and for how long that is told: what control acts on, no longer than
+    control would; what changes slowly and is asked for seldom, longer; what its driver was told last stays so."""
+    yield "measured", told.position, max_age_s
+    yield "velocity_per_s", told.velocity, max_age_s
+    yield "current_a", told.current_a, max_age_s
+    yield "moving", told.moving, max_age_s
+    if isinstance(told, RotatorTelemetry):
+        yield "sent", told.goal_sent_deg, math.inf
+        yield "torque_nm", told.torque_nm, max_age_s
+        yield "in_position", told.in_position, max_age_s
+        yield "voltage_v", told.voltage_v, KNOWN_FOR_S
+        yield "temperature_c", told.temperature_c, KNOWN_FOR_S
+        yield "torque_on", told.torque_on, KNOWN_FOR_S
+        return
+    yield "sent", told.target_sent_mm, math.inf
+    yield "duty_percent", told.duty_percent, max_age_s
+    flags = told.flags
+    if flags is not None:
+        yield "flags", Reading(tuple(sorted(flags.value)), flags.time_s, flags.valid), KNOWN_FOR_S
+        # it is reckoned anew with every feedback
+        yield "thermal_load", Reading(told.thermal_load, flags.time_s, flags.valid), KNOWN_FOR_S

@@ -1,4 +1,4 @@
-"""Every number in the configuration and in the status says its unit in its name."""
+"""Every number in the configuration and in the status says its unit in its name, and what was measured its validity."""
 
 from __future__ import annotations
 
@@ -66,3 +66,65 @@ def test_the_walk_finds_the_fields() -> None:
 def test_number_says_its_unit(field: str) -> None:
     model, name = field.split(".")
     assert UNITS.search(name) or name in DIMENSIONLESS or (model == "AxisStatus" and name in UNIT_BESIDE)
+
+
+OF_THE_TICK = {
+    "AxisStatus": {"requested", "limited", "arrived", "counters"},
+    "AheadStatus": {"confidence"},
+    "SoilStatus": {"confidence", "frames_per_s"},
+    "DecisionStatus": {"angle_deg", "kept", "since_m"},
+    "FaultStatus": {"present"},
+    "RequirementStatus": {"met", "mandatory"},
+    "LeaseStatus": {"remaining_s"},
+    "CameraStatus": {"restarts_n"},
+    "TickStatus": {"rate_hz", "overruns_n", "lateness_p99_ms"},
+    "Status": {"time_s", "simulated", "arming", "stop_n"},
+}
+"""What the daemon decided, counted or was told itself, and knows at ``time_s``."""
+AGED_BY = {
+    "AxisStatus": "ages_s",
+    "AttitudeStatus.height_mm": "lifts_age_s",
+    "AttitudeStatus.slope_deg": "lifts_age_s",
+    "AttitudeStatus.pitch_deg": "pitch_age_s",
+    "SoilStatus": "age_s",
+    "ThirdsStatus": "",  # part of SoilStatus, which is null where it is not known
+    "AheadStatus": "",  # likewise
+    "VehicleStatus.speed_m_per_s": "age_s",
+    "VehicleStatus.travelled_m": "travelled_age_s",
+    "CameraStatus.settings_read_back": "settings_age_s",
+}
+"""Where the age of a measured value stands, by model or field."""
+
+
+def _status_models(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    yield model
+    for field in model.model_fields.values():
+        for inner in models_in(field.annotation):
+            yield from _status_models(inner)
+
+
+def _values(model: type[BaseModel]) -> Iterator[tuple[str, object]]:
+    """What has a value that may be wrong by now: numbers, truths, and the device's own words."""
+    for name, field in model.model_fields.items():
+        arguments = {field.annotation, *typing.get_args(field.annotation)}
+        if is_number(field.annotation) or bool in arguments or {int, float} & arguments or name == "flags":
+            yield name, field
+
+
+STATUS_VALUES = sorted(
+    {(model, name) for model in {*_status_models(Status)} for name, _ in _values(model)},
+    key=lambda m: (str(m[0]), m[1]),
+)
+
+
+@pytest.mark.parametrize(("model", "name"), STATUS_VALUES, ids=lambda part: getattr(part, "__name__", part))
+def test_what_was_measured_is_null_where_it_is_not_known_and_has_an_age(model: type[BaseModel], name: str) -> None:
+    if name.endswith("age_s") or name == "ages_s" or name in OF_THE_TICK.get(model.__name__, set()):
+        return
+    aged_by = AGED_BY.get(f"{model.__name__}.{name}", AGED_BY.get(model.__name__))
+    assert aged_by is not None, "say in this file where its age stands, or that it is of the tick"
+    if not aged_by or (model.__name__, name) == ("SoilStatus", "frame_number_n"):
+        return
+    assert aged_by in model.model_fields
+    default = model.model_fields[name].get_default()
+    assert default in (None, {}), "a value that nobody measured is not told"

@@ -155,12 +155,18 @@ async def test_what_is_past_its_age_is_told_as_unknown(tmp_path: Path) -> None:
     await bench.ticks(5, zone=Zone.LEFT, share_left=1.0, volume_left_l=3.0)
     told = build_status(Config(), bench.loop, _Eyes())  # type: ignore[arg-type]  # all that is asked of it
     assert (told.soil.zone, told.soil.share_left, told.soil.volume_left_l) == (Zone.LEFT, 1.0, 3.0)
-    assert told.axes["rotation"].measured is not None
+    rotation = told.axes["rotation"]
+    assert rotation.measured is not None
+    assert "measured" in rotation.ages_s
+    assert all(0.0 <= age_s <= 0.2 for name, age_s in rotation.ages_s.items() if name != "sent")
+    assert told.attitude.height_mm is not None
+    assert told.attitude.lifts_age_s is not None
+    assert told.axes["tilt"].flags is not None
     bench.machine.rotation.lose()
     await bench.ticks(200)
     told = build_status(Config(), bench.loop, _Eyes())  # type: ignore[arg-type]  # as above
     assert (told.soil.zone, told.soil.confidence, told.soil.share_left, told.soil.volume_left_l) == (
-        Zone.UNKNOWN, 0.0, 0.0, None
+        Zone.UNKNOWN, 0.0, None, None
     )  # fmt: skip
     assert told.soil.age_s is not None
     assert told.soil.age_s > 3.0
@@ -168,3 +174,11 @@ async def test_what_is_past_its_age_is_told_as_unknown(tmp_path: Path) -> None:
     assert (lost.measured, lost.velocity_per_s, lost.moving) == (None, None, None)
     assert lost.measured_age_s is not None
     assert lost.measured_age_s > 3.0
+    assert "measured" not in lost.ages_s
+    bench.machine.lift_left.lose()
+    bench.machine.tilt.lose()
+    await bench.ticks(300)
+    told = build_status(Config(), bench.loop, _Eyes())  # type: ignore[arg-type]  # as above
+    attitude, tilt = told.attitude, told.axes["tilt"]
+    assert (attitude.height_mm, attitude.lifts_age_s, attitude.pitch_deg, attitude.pitch_age_s) == (None,) * 4
+    assert (tilt.flags, tilt.thermal_load) == (None, None)
