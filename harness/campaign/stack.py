@@ -1,4 +1,7 @@
-"""Rig and daemon as processes, a client of each, and what is measured while a fault is present."""
+"""Rig and daemon as processes, a client of each, and what is measured while a fault is present.
+
+A campaign that is killed takes them with it (:mod:`harness.bound`).
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from typing import Any
 from graderd.client import AsyncClient, ClientError, LeaseLostError, RefusedError
 from graderd.hal.errors import DeviceError
 from graderd.simulator.control_client import RigControl
+from harness.bound import bound
 from harness.campaign.watch import Watch
 
 START_S = 60.0
@@ -114,7 +118,7 @@ class Stack:
         ready = self.directory / "rig.json"
         ready.unlink(missing_ok=True)
         self._rig = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "graderd.simulator", "--dir", str(self.directory)
+            *bound(sys.executable, "-m", "graderd.simulator", "--dir", str(self.directory))
         )
         await self.until(ready.exists, START_S, "the rig does not get ready")
         await self._control.close()
@@ -133,7 +137,7 @@ class Stack:
         """Start the daemon; its log is appended to the former's."""
         with self.log_path.open("ab") as log:
             self._daemon = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "harness.campaign.daemon"),
+                *bound(sys.executable, "-m", "harness.campaign.daemon"),
                 *("--config", str(self.config_path), "--rig-dir", str(self.directory)),
                 env=os.environ | {"GRADERD_CAMPAIGN_BREAK": self._broken, "STATE_DIRECTORY": ""},
                 stdout=log,
@@ -167,7 +171,7 @@ class Stack:
     async def guard(self) -> int:
         """Run ``graderd guard`` as systemd does after the daemon ended; returns its exit status."""
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "graderd", "guard", "--config", str(self.config_path)),
+            *bound(sys.executable, "-m", "graderd", "guard", "--config", str(self.config_path)),
             env=os.environ | {"STATE_DIRECTORY": ""},
         )
         return await process.wait()
