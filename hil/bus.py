@@ -209,10 +209,12 @@ def couple(one: str, other: str) -> None:
         subprocess.run(["cangw", "-A", "-s", source, "-d", destination, "-e"], check=True)
 
 
-def add_vcan(name: str) -> None:
-    """Make a virtual CAN interface, or take the one of that name, and set it up."""
+def add_vcan(name: str, *, fd: bool = False) -> None:
+    """Make a virtual CAN interface, or take the one of that name, and set it up. ``fd``: it carries CAN FD frames."""
     if not interface_exists(name):
         ip("link", "add", "dev", name, "type", "vcan")
+    if fd:
+        ip("link", "set", name, "mtu", "72")
     ip("link", "set", name, "txqueuelen", "1000", "up")
 
 

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import signal
 import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
+import pytest
+
+from hil import bus
 from hil.bus import ADDRESS_CLAIMED, KernelNode, RawBus, daemons_claim
 from hil.service import Grader, Rig, faults, run, wait_for
-from tests.hil.conftest import STOP_PGN
+from tests.hil.conftest import STOP_PGN, bus_users
 
 WIRE = "wire0"
+DUMPED = "dump0"
 OURS = 0xE7
 LIFT_LEFT = 0x13
 ACM = 0xEF00
@@ -120,6 +126,30 @@ def test_can_utils_read_and_write_the_same_bus(ready: Grader, rig: Rig, listener
     finally:
         receiver.kill()
     assert "67 72 61 64 65 72 64" in said.lower(), said  # "graderd"
+
+
+@pytest.mark.error_frames
+def test_graderd_can_dump_shows_a_live_bus_with_all_kinds_of_frames(ready: Grader) -> None:
+    """On an interface of the kernel's, as for somebody who looks at a bus that no daemon has."""
+    bus.add_vcan(DUMPED, fd=True)
+    try:
+        dump = subprocess.Popen(["graderd", "can", "dump", DUMPED, "--json"], stdout=subprocess.PIPE, text=True)
+        try:
+            assert dump.stdout is not None
+            wait_for("graderd can dump to listen", lambda: bus_users(DUMPED), 20.0)
+            sent = ("18EF13E7#DC05191500000000", "18FEF180##1AABBCCDD", "20000040#0000000000000000", "18FEF180#R8")
+            for frame in sent:
+                run("cansend", DUMPED, frame)
+            seen = [json.loads(dump.stdout.readline()) for _ in sent]
+            assert [frame["kind"] for frame in seen] == ["data", "fd", "error", "remote"]
+            assert [frame["name"].split()[0] for frame in seen] == ["ACM", "CAN", "error", "remote"]
+            assert seen[2]["signals"]["state"] == "bus_off"
+            dump.send_signal(signal.SIGINT)
+            assert dump.wait(20.0) == 0
+        finally:
+            dump.kill()
+    finally:
+        bus.remove_vcan(DUMPED)
 
 
 def test_a_claiming_daemon_of_can_utils_lives_beside_it(ready: Grader, listener: RawBus) -> None:
