@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import select
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,10 +15,12 @@ import pytest
 
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import catalogue_key
+from harness.bound import bound
 from harness.campaign.__main__ import CASES, about, chosen, joined
 from harness.campaign.daemon import BREAKS
 from harness.campaign.model import Outcome, Phase
 from harness.campaign.page import write
+from harness.campaign.stack import Stack
 
 SHORT_S = 240.0
 KEYS = {
@@ -62,6 +66,47 @@ def test_parts_make_up_the_whole(tmp_path: Path) -> None:
     assert len(data["results"]) == len(CASES) * len(Phase)
     write(data, CASES, tmp_path)
     assert f"0 of {len(data['results'])} injections passed" in (tmp_path / "fault-campaign.md").read_text("utf-8")
+
+
+async def test_a_campaign_that_is_killed_takes_its_processes_with_it() -> None:
+    code = """
+import subprocess, sys, time
+from harness.bound import bound
+child = subprocess.Popen(bound(sys.executable, "-c", "import time; print('here', flush=True); time.sleep(60)"))
+print(child.pid, flush=True)
+child.wait()
+"""
+    campaign = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", code), stdout=asyncio.subprocess.PIPE, env=os.environ | {"PYTHONPATH": os.getcwd()}
+    )
+    assert campaign.stdout is not None
+    async with asyncio.timeout(30.0):
+        said = {(await campaign.stdout.readline()).strip() for _ in range(2)}
+    (pid,) = (int(line) for line in said - {b"here"})
+    child = os.pidfd_open(pid)
+    try:
+        os.kill(pid, signal.SIGSTOP)  # one that is halted goes too
+        campaign.kill()
+        await campaign.wait()
+        ended, _, _ = await asyncio.to_thread(select.select, [child], [], [], 10.0)
+        assert ended
+    finally:
+        os.close(child)
+
+
+async def test_every_process_of_a_campaign_is_bound_to_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    started: list[tuple[str, ...]] = []
+
+    async def start(*command: str, **_: Any) -> None:
+        started.append(command)
+        raise OSError("seen enough")
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+    stack = Stack(tmp_path)
+    for begin in (stack.start_rig, stack.launch_daemon, stack.guard):
+        with pytest.raises(OSError, match="seen enough"):
+            await begin()
+    assert [command[:3] for command in started] == [bound()[:3]] * 3
 
 
 @pytest.mark.whole_machine
