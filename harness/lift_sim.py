@@ -27,20 +27,19 @@ from harness.fakes import FakeActuator, FakeEyes, FakeRotator
 
 CONTROL_PERIOD_S: Final = 0.1
 """Of the control messages on the bus."""
+FEEDBACK_PERIOD_S: Final = 0.105
 RENEW_S: Final = 0.1
 LOOK_S: Final = 0.01
-KNOWN_AFTER_MM: Final = 25.0
 AT_TARGET_MM: Final = 1.6
 """An Electrak rests up to 1.4 mm short of its target."""
 
 
 @dataclass(frozen=True)
 class Move:
-    """One move as it was seen from outside. ``known``: the pair had moved both sides far enough before to know how fast
-    they are; ``apart_mm``: the most the tubes differed; ``stopped``: why it ended before its goal, empty where it did
-    not; ``faults``: the names of all that were active at any time."""
+    """One move as it was seen from outside. ``own_s``: what the slower side by itself takes; ``apart_mm``: the most the
+    tubes differed; ``stopped``: why it ended before its goal, empty where it did not; ``faults``: the names of all that
+    were active at any time."""
 
-    known: bool
     way_mm: float
     took_s: float
     own_s: float
@@ -134,15 +133,18 @@ class LiftMachine:
 
 
 @asynccontextmanager
-async def lift_machine(clock: SimulatedLoop, seed: int = 0, config: Config | None = None) -> AsyncIterator[LiftMachine]:
-    """Armed and at rest."""
+async def lift_machine(
+    clock: SimulatedLoop, seed: int = 0, config: Config | None = None, *, offset_s: float = 0.05
+) -> AsyncIterator[LiftMachine]:
+    """Armed and at rest. ``offset_s``: how much later than the bus the daemon's ticks and a client begin, which decides
+    how they fall to control messages and feedback; feedback is at a phase of its own for each ``seed``."""
     config = config or Config()
     speed_percent = config.lift_left.model_dump()["speed_percent"]
     async with Machine(clock, names=(*LIFTS, "spare"), seed=seed, speed_percent=speed_percent) as machine:
         lifts = LiftMachine(clock, machine, config)
+        await asyncio.sleep(0.02 + offset_s)
         running = asyncio.create_task(lifts.loop.run(), name="control")
         try:
-            await asyncio.sleep(0.02 + random.Random(seed).random() * 0.2)
             await lifts.arm()
             yield lifts
         finally:
@@ -175,31 +177,39 @@ class SlowSide:
 @dataclass(frozen=True)
 class Trial:
     """One machine's moves. ``factors``: speed of left and right against the model's; ``hitch``: what befalls a side in
-    mid-move: ``""``, ``"sticks"`` (up to 0.4 s) or ``"deaf"`` (two feedbacks in a row are lost)."""
+    mid-move: ``""``, ``"sticks"`` (up to 0.4 s) or ``"deaf"`` (two feedbacks in a row are lost). ``offset_s``: see
+    :func:`lift_machine`."""
 
     seed: int
     factors: tuple[float, float]
     load_n: float
     moves_n: int
     hitch: str = ""
+    offset_s: float = 0.05
 
 
 def trials(moves_n: int, *, hitch: str = "", per_machine_n: int = 10, seed: int = 0) -> list[Trial]:
-    """So many moves over machines of every kind: equal sides, and one side 10 to 40 % slower."""
+    """So many moves over machines of every kind: equal sides, one side 10 to 40 % slower, and every way that ticks,
+    control messages and feedback may fall to each other."""
     chance, found = random.Random(f"{seed}/{hitch}"), []
     for number in range(-(-moves_n // per_machine_n)):
         slow = 1.0 if number % 5 == 0 else chance.uniform(0.6, 0.9)
         both = (slow, 1.0) if chance.random() < 0.5 else (1.0, slow)
         load_n = chance.choice((0.0, 0.0, 400.0, 800.0))
-        found.append(Trial(1000 * seed + number, both, load_n, min(per_machine_n, moves_n), hitch))
+        found.append(Trial(1000 * seed + number, both, load_n, min(per_machine_n, moves_n), hitch, _offset_s(number)))
     return found
+
+
+def _offset_s(number: int) -> float:
+    """Evenly over a feedback period, however many there are."""
+    return number * 0.618 % 1.0 * FEEDBACK_PERIOD_S
 
 
 async def run_trial(clock: SimulatedLoop, trial: Trial) -> list[Move]:
     """All moves of one machine, one after the other from where it rested."""
     moves: list[Move] = []
     chance = random.Random(f"{trial.seed}/moves")
-    async with lift_machine(clock, trial.seed) as lifts:
+    async with lift_machine(clock, trial.seed, offset_s=trial.offset_s) as lifts:
         for unit, factor in zip(lifts.units.values(), trial.factors, strict=True):
             unit.behaviour.speed_factor, unit.load_n = factor, trial.load_n
         slow = SlowSide(clock, lifts.machine)
@@ -216,8 +226,7 @@ async def run_trial(clock: SimulatedLoop, trial: Trial) -> list[Move]:
             await asyncio.gather(hitch, return_exceptions=True)
             for unit, factor in zip(lifts.units.values(), trial.factors, strict=True):
                 unit.behaviour.speed_factor, unit.faults.silent = factor, False
-            known = any(abs(move.way_mm) > KNOWN_AFTER_MM for move in moves)
-            moves.append(Move(known, target_mm - at_mm, took_s, await own, apart_mm, stopped, faults))
+            moves.append(Move(target_mm - at_mm, took_s, await own, apart_mm, stopped, faults))
             at_mm = target_mm
             if stopped:
                 await asyncio.sleep(1.0)
@@ -268,7 +277,7 @@ class Loss:
 async def lose_a_side(clock: SimulatedLoop, loss: str, seed: int) -> Loss:
     """Lift both at full speed; a fault of the simulated actuator befalls one, at any point of its feedback period."""
     chance = random.Random(f"{seed}/{loss}")
-    async with lift_machine(clock, seed) as lifts:
+    async with lift_machine(clock, seed, offset_s=_offset_s(seed)) as lifts:
         lost, other = (lifts.units[name] for name in chance.sample(LIFTS, 2))
         await lifts.jog(60.0)
         await lifts.settle()

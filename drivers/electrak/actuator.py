@@ -39,6 +39,8 @@ WAKE_TIMEOUT_S: Final = 3.0
 _SILENCE_S: Final = 1.0
 _WAKING_S: Final = 0.5
 """A claim so soon after our first message of a while is that of a unit which fell asleep meanwhile."""
+_APART_S: Final = 0.015
+"""Control messages out of turn come no closer after one another than this, so a tick that wants many sends few."""
 _CLOSE_REPEATS_N: Final = 3
 _CONTROL_PRIORITY: Final = 6
 
@@ -235,6 +237,9 @@ class ElectrakActuator:
             raise CommandRangeError(self.name, f"speed share {speed_share} is not above 0 and at most 1")
         self._target_at_s = now_s
         self._planner.set_target(target_mm, speed_share)
+        urgent = self._rested(now_s) and self._planner.is_urgent(self._track.motion(now_s))
+        if urgent and now_s - self._control_at_s >= _APART_S:
+            self._link.send_control(self)
 
     def hold(self) -> None:
         """Motion disabled with the next control message, sent at once. Allowed in every state, idempotent."""
@@ -329,8 +334,11 @@ class ElectrakActuator:
         if self._planner.target_mm is not None and now_s - self._target_at_s > self.settings.target_timeout_s:
             self._counters["target_timeouts_n"] += 1
             self._planner.hold()
-        may_move = self._thermal.may_move(now_s) and not self._overload.waiting
-        return self._planner.control(self._track.motion(now_s), may_move=may_move)
+        return self._planner.control(self._track.motion(now_s), may_move=self._rested(now_s))
+
+    def _rested(self, now_s: float) -> bool:
+        """Neither too warm nor waiting after an overload."""
+        return self._thermal.may_move(now_s) and not self._overload.waiting
 
     def _on_overload_flag(self, tripped: bool, now_s: float) -> None:
         verdict = self._overload.on_feedback(tripped, self._lifecycle is Lifecycle.ACTIVE, now_s)

@@ -21,6 +21,8 @@ _FLOOR_MARGIN_PERCENT: Final = 5
 _BIAS_GAIN: Final = 0.25
 _BIAS_RANGE: Final = (0.4, 1.6)
 """Learned bias, in parts of the profile's dead zone."""
+_SLOWER_SHARE: Final = 0.08
+"""So much slower than the last message said is told at once: a step of its duty at the usual speed."""
 _SETTLED_N: Final = 3
 _CREEP_MM: Final = 0.25
 
@@ -54,6 +56,7 @@ class MotionPlanner:
         self._start_mm = figures.restart_zone_mm + _START_MARGIN_MM - figures.dead_zone_mm
         self._target_mm: float | None = None
         self._share = 1.0
+        self._sent_share = 0.0
         self._duty_carry_percent = 0.0
         self._direction = 0
         self._still_n = 0
@@ -82,6 +85,15 @@ class MotionPlanner:
             self.phase = Phase.REST
         self._target_mm = target_mm
         self._share = speed_share
+
+    def is_urgent(self, motion: Motion) -> bool:
+        """Whether the target is one that the next message should not be waited for: to start, or to go slower. Two
+        that start or must keep together then do so by when they are told, not by how their messages fall."""
+        if self._target_mm is None:
+            return False
+        if self.phase is Phase.MOVE:
+            return self._share < self._sent_share - _SLOWER_SHARE
+        return abs(self._target_mm - motion.position_mm) > self._start_mm
 
     def hold(self) -> None:
         """Forget the target; motion is disabled from the next message on."""
@@ -113,6 +125,7 @@ class MotionPlanner:
         sent_mm = aim_mm if final else short_mm
         sent_mm = min(max(sent_mm, 0.0), figures.stroke_mm)
         self._final_sent_mm = sent_mm if final else None
+        self._sent_share = self._share
         return Control(round(sent_mm, 1), self._current_limit_a, duty_percent, motion_enable=True)
 
     def on_feedback(self, motion: Motion) -> None:

@@ -28,7 +28,9 @@ class LiftPairSettings(Settings):
     full_speed_mm_per_s: Positive = Field(
         33.0, le=100.0, description="guess of a lift's speed at speed share 1, until learned; no Electrak does 100"
     )
-    first_share: Positive = Field(0.6, le=1.0, description="speed share while a side's speed is still unknown")
+    first_share: Positive = Field(
+        1.0, le=1.0, description="speed share while a side's speed is still unknown; less is slower, and gentler"
+    )
     approach_share: Positive = Field(
         0.7, le=1.0, description="speed share near the target, where an Electrak slows down to 35 % duty by itself"
     )
@@ -100,27 +102,35 @@ class PairCommand(NamedTuple):
 
 
 _HOLD_BOTH: Final = PairCommand(SideCommand(None), SideCommand(None))
-_SHARE_LAG_S: Final = 0.15
-"""From a speed share to the speed it gives: control period and soft start."""
+_SOFT_START_S: Final = 0.2
+"""An Electrak takes so long from rest to the speed that it was told, evenly; slower it goes at once."""
+_BREAK_AWAY_SHARE: Final = 0.4
+"""It does not turn before so much of it: 20 % duty of 50."""
+_IDLE_SHARE: Final = 0.06
+"""So much of it only keeps it from standing: speed begins from there on, on a straight line (3 % duty of 50)."""
+_INERTIA_S: Final = 0.025
+"""From the motor's duty to the tube's speed, and to the bus."""
 _MIN_DRIVE_S: Final = 0.01
-_KNOWN_DRIVE_S: Final = 0.05
-_KNOWN_MM: Final = 1.5
-"""A gain counts as known after this much movement."""
-_HINT_DRIVE_S: Final = 0.05
-"""What is known of the other direction weighs as much as so much movement in this one, until that is seen."""
+_KNOWN_MM: Final = 4.0
+"""A side's speed counts as known after this much movement."""
+_SHARE_STEP: Final = 0.05
+_SLOWEST: Final = 0.2
+"""Part of the guessed speed."""
+_GUESS_DRIVE_S: Final = 0.06
+"""What is guessed before anything was seen weighs as much as so much drive."""
+_HINT_DRIVE_S: Final = 0.15
+"""What is known of the other direction weighs as much as so much drive in this one, until that is seen."""
 _FORGET: Final = 0.85
+_TAPER_MM: Final = 6.0
+"""Lifts slow down by themselves this close to their target."""
 _NEAR_MM: Final = 8.0
-"""Lifts slow down by themselves this close to their target: nothing is learned there."""
-_WAY_MM: Final = 15.0
-"""A move shorter than this is start and end only: nothing is learned from it."""
-_TAPER: Final = 0.5
-_FIRST_CATCH_UP_HZ: Final = 6.0
-"""How much faster the side behind goes while speeds are unknown, mm/s for each mm."""
-_FIRST_NOISE_MM: Final = 0.5
-"""So much the sides seem apart because one reading is older than the other."""
-_SETTLED_SHARE: Final = 0.1
-"""While the acting share is estimated to be further than this from the commanded one, when it acts is a guess (the
-next control message, break-away, soft start): a gain learned then would be one of the guess."""
+"""From here on the pair goes no faster than they will."""
+_END_MM: Final = 3.0
+"""This close to its target it stops by itself: nothing is learned there."""
+_STICKS: Final = 0.5
+"""A side that made less than this part of the way expected of it between two readings sticks."""
+_STICKS_MM: Final = 0.7
+"""And lacks at least so much: more than noise and the readings' times."""
 _AHEAD_N: Final = 3
 """A side is held back when it is too far ahead in so many steps; a single estimate is too noisy for that."""
 _FAR_AHEAD: Final = 1.3
@@ -138,10 +148,13 @@ _NEW_TARGET_MM: Final = 0.05
 class _Side:
     """One lift: its way, its newest reading, and how fast it is for a speed share.
 
-    ``drive_s`` is the time integral of the share that acts (the commanded one, lagging); a side's gain is millimetres
-    for one second of it. Position between two readings is the last one plus gain times the drive since.
+    ``acting_share`` is the commanded one after a soft start, ``turning`` what it makes of it, as a part of its full
+    speed, and ``drive_s`` the time integral of that; a side's gain is millimetres for one second of it. Position
+    between two readings is the last one plus gain times the drive since.
+    ``sticks``: it ran, and made hardly any of the way that was expected of it between the last two readings.
     """
 
+    guess_mm_per_s: float
     start_mm: float = 0.0
     target_mm: float = 0.0
     position_mm: float = 0.0
@@ -150,8 +163,10 @@ class _Side:
     reading_drive_s: float = 0.0
     share: float = 0.0
     acting_share: float = 0.0
+    turning: float = 0.0
     drive_s: float = 0.0
-    settled: bool = True
+    runs: bool = False
+    sticks: bool = False
     learned: dict[int, tuple[float, float]] = field(default_factory=dict)
     moved_at_s: float = 0.0
     moved_from_mm: float = 0.0
@@ -172,50 +187,68 @@ class _Side:
         return 1 if self.target_mm >= at_mm else -1
 
     @property
-    def gain_mm_per_s(self) -> float | None:
-        """Speed at share 1 in the present direction, or in the other one until that is learned: wear and supply are the
-        same. None: nothing is known."""
-        return self._gain_towards(self.direction) or self._gain_towards(-self.direction)
+    def known(self) -> bool:
+        """Whether enough was seen of it to say how fast it is, in either direction: wear and supply are the same."""
+        return any(moved_mm > _KNOWN_MM for moved_mm, _ in self.learned.values())
 
-    def _gain_towards(self, direction: int) -> float | None:
-        moved_mm, drive_s = self.learned.get(direction, (0.0, 0.0))
-        return moved_mm / drive_s if drive_s > _KNOWN_DRIVE_S and moved_mm > _KNOWN_MM else None
+    @property
+    def gain_mm_per_s(self) -> float:
+        """Speed at share 1 in the present direction; one that hardly moved is not thought slower than the slowest."""
+        moved_mm, drive_s = self._seen(self.direction)
+        return max(moved_mm / drive_s, _SLOWEST * self.guess_mm_per_s)
 
-    def drive(self, elapsed_s: float) -> None:
-        """Let time pass."""
-        self.acting_share += (self.share - self.acting_share) * min(1.0, elapsed_s / _SHARE_LAG_S)
-        self.drive_s += self.acting_share * elapsed_s
-        self.settled = self.settled and abs(self.share - self.acting_share) <= _SETTLED_SHARE
+    def _seen(self, direction: int) -> tuple[float, float]:
+        """What is known of a direction: from itself, from the other one, or guessed."""
+        other_mm, other_s = self.learned.get(-direction, (0.0, 0.0))
+        if direction in self.learned:
+            return self.learned[direction]
+        if other_mm > _KNOWN_MM:
+            return other_mm / other_s * _HINT_DRIVE_S, _HINT_DRIVE_S
+        return self.guess_mm_per_s * _GUESS_DRIVE_S, _GUESS_DRIVE_S
+
+    def halt(self) -> None:
+        """It is told to hold: nothing drives it from now on."""
+        self.share = self.acting_share = self.turning = 0.0
+        self.runs = self.sticks = False
+
+    def drive(self, elapsed_s: float, approach_share: float) -> None:
+        """Let time pass. Near its target it goes no faster than ``approach_share``, whatever it was told."""
+        if self.share <= self.acting_share:
+            self.acting_share = self.share
+        else:
+            self.acting_share = min(self.share, self.acting_share + self.share * elapsed_s / _SOFT_START_S)
+        tapers = abs(self.target_mm - self.position_mm) < _TAPER_MM
+        acting = min(self.acting_share, approach_share) if tapers else self.acting_share
+        turning = (acting - _IDLE_SHARE) / (1.0 - _IDLE_SHARE) if acting >= _BREAK_AWAY_SHARE else 0.0
+        self.turning += (turning - self.turning) * (1.0 - math.exp(-elapsed_s / _INERTIA_S))
+        self.drive_s += self.turning * elapsed_s
 
     def see(self, reading: SideReading, now_s: float, *, learn: bool) -> None:
         """Take the newest reading (which may be the one of before)."""
         last = self.reading
         if last is None or reading.time_s > last.time_s:
-            drive_s = self.drive_s - self.acting_share * max(0.0, now_s - reading.time_s)
+            drive_s = max(self.reading_drive_s, self.drive_s - self.turning * max(0.0, now_s - reading.time_s))
             if last is not None:
-                moved_mm = reading.position_mm - last.position_mm
-                moved_before = abs(self.velocity_mm_per_s) > _STILL_MM_PER_S
-                self.velocity_mm_per_s = moved_mm / (reading.time_s - last.time_s)
-                if learn and self.settled and moved_before:
-                    self._learn(moved_mm * self.direction, drive_s - self.reading_drive_s)
-            self.reading, self.reading_drive_s, self.settled = reading, drive_s, True
-        gain = self.gain_mm_per_s
-        if gain:
-            coming_mm = gain * (self.drive_s - self.reading_drive_s)
-        else:
-            coming_mm = max(0.0, self.velocity_mm_per_s * self.direction) * max(0.0, now_s - reading.time_s)
+                self.velocity_mm_per_s = (reading.position_mm - last.position_mm) / (reading.time_s - last.time_s)
+                self._judge((reading.position_mm - last.position_mm) * self.direction, drive_s, learn=learn)
+            self.reading, self.reading_drive_s = reading, drive_s
+        coming_mm = 0.0 if self.sticks else self.gain_mm_per_s * (self.drive_s - self.reading_drive_s)
         remaining_mm = abs(self.target_mm - reading.position_mm)
-        if remaining_mm < _NEAR_MM:  # it slows down and stops by itself
-            coming_mm = min(coming_mm * _TAPER, remaining_mm) if abs(self.velocity_mm_per_s) > _STILL_MM_PER_S else 0.0
+        if remaining_mm < _NEAR_MM:  # it stops by itself
+            coming_mm = min(coming_mm, remaining_mm) if abs(self.velocity_mm_per_s) > _STILL_MM_PER_S else 0.0
         self.position_mm = reading.position_mm + self.direction * coming_mm
 
-    def _learn(self, moved_mm: float, drive_s: float) -> None:
-        near = abs(self.target_mm - self.position_mm) < _NEAR_MM or abs(self.way_mm) < _WAY_MM
-        if drive_s < _MIN_DRIVE_S or near or moved_mm < 0.0:
-            return
-        hint = self._gain_towards(-self.direction) or 0.0
-        old_mm, old_s = self.learned.get(self.direction, (hint * _HINT_DRIVE_S, _HINT_DRIVE_S if hint else 0.0))
-        self.learned[self.direction] = (_FORGET * old_mm + moved_mm, _FORGET * old_s + drive_s)
+    def _judge(self, moved_mm: float, drive_s: float, *, learn: bool) -> None:
+        """What a newer reading says: it sticks, or how fast it is."""
+        driven_s = drive_s - self.reading_drive_s
+        lacking_mm = self.gain_mm_per_s * driven_s - moved_mm
+        ends = abs(self.target_mm - self.position_mm) < _END_MM
+        lags = moved_mm < _STICKS * (moved_mm + lacking_mm)
+        self.sticks = lags and lacking_mm > _STICKS_MM and self.known and not ends and (self.runs or self.sticks)
+        self.runs = driven_s > _MIN_DRIVE_S and not lags
+        if learn and not self.sticks and not ends and driven_s > _MIN_DRIVE_S and moved_mm >= 0.0:
+            old_mm, old_s = self._seen(self.direction)
+            self.learned[self.direction] = (_FORGET * old_mm + moved_mm, _FORGET * old_s + driven_s)
 
 
 class LiftPair:
@@ -224,7 +257,8 @@ class LiftPair:
     def __init__(self, settings: LiftPairSettings | None = None, max_speed_mm_per_s: float = math.inf) -> None:
         self._settings = settings or LiftPairSettings()
         self._max_speed_mm_per_s = max_speed_mm_per_s
-        self._sides = (_Side(), _Side())
+        guess_mm_per_s = self._settings.full_speed_mm_per_s
+        self._sides = (_Side(guess_mm_per_s), _Side(guess_mm_per_s))
         self._moving = False
         self._waiting: int | None = None
         self._ahead_n = 0
@@ -239,7 +273,7 @@ class LiftPair:
         self._stopped = ""
         self._last_s = None
         for side in self._sides:
-            side.share = side.acting_share = 0.0
+            side.halt()
             side.reading = None
             side.velocity_mm_per_s = 0.0
 
@@ -264,7 +298,7 @@ class LiftPair:
         if any(now_s - reading.time_s > self._settings.silent_s for reading in (left, right)):
             return self._pause(now_s)
         for side, reading in zip(self._sides, (left, right), strict=True):
-            side.drive(elapsed_s)
+            side.drive(elapsed_s, self._settings.approach_share)
             side.see(reading, now_s, learn=self._moving and self._waiting is None)
         self._aim((left_target_mm, right_target_mm), now_s)
         stuck = self._stuck(now_s)
@@ -291,8 +325,7 @@ class LiftPair:
     def _pause(self, now_s: float) -> PairCommand:
         """Nobody knows where one side is: both hold, and go on along their line when both are measured again."""
         for side in self._sides:
-            side.share = side.acting_share = 0.0
-            side.settled = False
+            side.halt()
             side.moved_at_s, side.moved_from_mm = now_s, side.position_mm
         return PairCommand(_HOLD_BOTH.left, _HOLD_BOTH.right, self._apart_mm)
 
@@ -347,6 +380,8 @@ class LiftPair:
         settings = self._settings
         if all(abs(side.target_mm - side.position_mm) < settings.apart_mm for side in self._sides):
             self._waiting = None  # at the end each side finds its own rest
+        elif self._waiting is None and any(side.sticks for side in self._sides):
+            self._waiting = 1 if self._sides[0].sticks else 0
         elif self._waiting is None:
             ahead_mm = [2.0 * d * s.way_sign for s, d in zip(self._sides, deviations_mm, strict=True)]
             index = 0 if ahead_mm[0] > ahead_mm[1] else 1
@@ -360,6 +395,7 @@ class LiftPair:
             if abs(behind.velocity_mm_per_s) < _STILL_MM_PER_S and (
                 self._apart_mm < settings.level_mm or left_mm < _START_MM
             ):
+                behind.halt()  # both begin anew
                 self._waiting = None
 
     def _catch_up_mm(self, waiting: int) -> float:
@@ -371,7 +407,7 @@ class LiftPair:
     def _catch_up(self, waiting: int) -> tuple[SideCommand, SideCommand]:
         """One side holds; the other goes slowly to the same point of the way and rests there, then both start anew."""
         ahead, behind = self._sides[waiting], self._sides[1 - waiting]
-        ahead.share = ahead.acting_share = 0.0
+        ahead.halt()
         behind.share = self._settings.min_share
         command = SideCommand(self._catch_up_mm(waiting), behind.share)
         return (SideCommand(None), command) if waiting == 0 else (command, SideCommand(None))
@@ -381,37 +417,28 @@ class LiftPair:
         settings = self._settings
         longest_mm = max(abs(side.way_mm) for side in self._sides)
         moving = [side for side in self._sides if abs(side.way_mm) > _MOVED_MM]
-        if len(moving) > 1 and any(side.gain_mm_per_s is None for side in moving):
-            return self._first_shares(longest_mm, min(abs(side.way_mm) for side in moving), deviations_mm)
-        gains = [side.gain_mm_per_s or settings.full_speed_mm_per_s for side in self._sides]
-        near = any(abs(side.target_mm - side.position_mm) < _NEAR_MM for side in moving)
-        most_share = settings.approach_share if near and len(moving) > 1 else 1.0
+        most_share, near = 1.0, False
+        if len(moving) > 1:
+            near = any(abs(side.target_mm - side.position_mm) < _NEAR_MM for side in moving)
+            if near:
+                most_share = settings.approach_share
+            if not all(side.known for side in moving):
+                shortest_mm = min(abs(side.way_mm) for side in moving)
+                most_share = min(most_share, settings.first_share * longest_mm / shortest_mm)
         pace_mm_per_s = min(
             (
-                min(most_share * gain, self._max_speed_mm_per_s) * longest_mm / abs(side.way_mm)
-                for gain, side in zip(gains, self._sides, strict=True)
-                if side in moving
+                min(most_share * side.gain_mm_per_s, self._max_speed_mm_per_s) * longest_mm / abs(side.way_mm)
+                for side in moving
             ),
             default=settings.full_speed_mm_per_s,
         )
-        for side, gain, deviation_mm in zip(self._sides, gains, deviations_mm, strict=True):
-            ahead_mm = max(0.0, 2.0 * deviation_mm * side.way_sign)
-            own_mm_per_s = pace_mm_per_s * (abs(side.way_mm) / longest_mm if longest_mm else 1.0)
-            share = (own_mm_per_s - settings.catch_up_hz * ahead_mm) / gain
-            side.share = min(max(share, settings.min_share), 1.0)
-        return self._commands()
-
-    def _first_shares(
-        self, longest_mm: float, shortest_mm: float, deviations_mm: tuple[float, float]
-    ) -> tuple[SideCommand, SideCommand]:
-        """Slowly, until both sides' speeds are known. The side that is seen to stay behind goes faster."""
-        settings = self._settings
-        longest_share = min(1.0, settings.first_share * longest_mm / shortest_mm)
         for side, deviation_mm in zip(self._sides, deviations_mm, strict=True):
-            behind_mm = max(0.0, -2.0 * deviation_mm * side.way_sign - _FIRST_NOISE_MM)
-            more = _FIRST_CATCH_UP_HZ * behind_mm / settings.full_speed_mm_per_s
-            share = longest_share * abs(side.way_mm) / longest_mm + more
-            side.share = min(max(share, settings.min_share), 1.0)
+            ahead_mm = 2.0 * deviation_mm * side.way_sign
+            own_mm_per_s = pace_mm_per_s * (abs(side.way_mm) / longest_mm if longest_mm else 1.0)
+            wanted_mm_per_s = min(own_mm_per_s - settings.catch_up_hz * ahead_mm, self._max_speed_mm_per_s)
+            share = wanted_mm_per_s / side.gain_mm_per_s
+            # One that may be as fast as it slows down to by itself is left to that: it starts sooner when told more.
+            side.share = 1.0 if near and share > most_share - _SHARE_STEP else min(max(share, settings.min_share), 1.0)
         return self._commands()
 
     def _commands(self) -> tuple[SideCommand, SideCommand]:

@@ -312,6 +312,42 @@ def test_hold_leaves_at_once_and_targets_never_jump_on_arming() -> None:
     run_simulated(main)
 
 
+def test_a_start_and_a_slower_speed_leave_at_once_and_what_can_wait_does() -> None:
+    async def main(loop: SimulatedLoop) -> None:
+        async with Machine(loop, names=LEFT) as machine:
+            axis = machine.axes["lift_left"]
+
+            def sent_by(share: float) -> int:
+                before_n = len(machine.frames)
+                axis.set_target_mm(280.0, share)
+                return len(machine.frames) - before_n
+
+            await axis.arm()
+            while loop.now_s() - machine.frames[-1][0] < 0.03:  # between two messages of the period
+                await asyncio.sleep(0.005)
+            assert sent_by(1.0) == 1, "the start"
+            await machine.drive({"lift_left": 280.0}, 0.53)
+            for share, expected_n in ((1.0, 0), (0.95, 0), (0.8, 1), (0.8, 0), (1.0, 0), (0.5, 0)):
+                assert sent_by(share) == expected_n, f"{share}; the last is too close on the heels of the one before"
+            await asyncio.sleep(0.02)
+            assert sent_by(0.5) == 1
+
+    run_simulated(main)
+
+
+def test_a_start_that_has_to_wait_floods_no_bus() -> None:
+    async def main(loop: SimulatedLoop) -> None:
+        async with Machine(loop, names=LEFT) as machine:
+            axis = machine.axes["lift_left"]
+            await axis.arm()
+            axis._thermal.load = 2.0  # too warm: it rests
+            before_n = axis.telemetry().counters["control_n"]
+            await machine.drive({"lift_left": 280.0}, 1.0)
+            assert axis.telemetry().counters["control_n"] - before_n <= 11
+
+    run_simulated(main)
+
+
 def test_arming_is_refused_while_the_overload_flag_is_still_set() -> None:
     async def main(loop: SimulatedLoop) -> None:
         async with Machine(loop, names=LEFT) as machine:

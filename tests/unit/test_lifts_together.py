@@ -14,14 +14,17 @@ from graderd.core import commands as cmd
 from harness.electrak_sim import SimulatedLoop, run_simulated
 from harness.lift_sim import Move, lift_machine, lose_a_side, run_trial, trials
 
-MOVES_N = int(os.environ.get("GRADERD_LIFT_MOVES", "30"))
+MOVES_N = int(os.environ.get("GRADERD_LIFT_MOVES", "36"))
+PER_MACHINE_N = 3
+"""Few, so that there are many machines: each falls otherwise to control messages and feedback."""
 
 
 def moves(hitch: str) -> list[Move]:
-    """So many moves with one kind of mishap, machine after machine."""
+    """So many moves with one kind of mishap, machine after machine; each machine's ticks, messages and feedback fall to
+    each other in a way of their own, evenly over a period."""
     return [
         move
-        for trial in trials(MOVES_N, hitch=hitch)
+        for trial in trials(MOVES_N, hitch=hitch, per_machine_n=PER_MACHINE_N)
         for move in run_simulated(lambda loop, trial=trial: run_trial(loop, trial))  # type: ignore[misc]
     ]
 
@@ -32,9 +35,7 @@ def test_healthy_sides_stay_within_3_mm_and_within_115_percent_of_the_slow_sides
     assert max(move.apart_mm for move in made) <= 3.0
     assert [move.stopped for move in made if move.stopped] == []
     assert [move.faults for move in made if move.faults] == []
-    known = [move for move in made if move.known]
-    assert len(known) > len(made) / 2
-    assert max(move.took_s / move.own_s for move in known) <= 1.15
+    assert max(move.took_s / move.own_s for move in made) <= 1.15
 
 
 @pytest.mark.slow
