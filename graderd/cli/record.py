@@ -183,13 +183,14 @@ def told_of(entry: Entry) -> dict[str, Any]:
         "config_sha256": "",
         "calibration_id": "",
         "gap_before": "",
+        "every_n": "1",
         "problem": "",
     }
     try:
         recording = Recording(entry.path)
     except DeviceError as error:
         return found | {"problem": error.cause}
-    kept = ("started", "version", "config_sha256", "calibration_id", "reason", "gap_before")
+    kept = ("started", "version", "config_sha256", "calibration_id", "reason", "gap_before", "every_n")
     extent = recording.extent
     return (
         found
@@ -211,7 +212,7 @@ def forecast_of(told: list[dict[str, Any]], config: Config) -> dict[str, Any]:
     def measured(kind: str) -> float | None:
         known = [f for f in told if f["kind"] == kind and (f["duration_s"] or 0.0) > 10.0][-5:]
         hours = sum(f["duration_s"] for f in known) / 3600.0
-        return sum(f["size_mb"] for f in known) / hours if known else None
+        return sum(f["size_mb"] * int(f["every_n"]) for f in known) / hours if known else None
 
     camera, own = config.camera, config.recording
     a_run, raw = measured("run"), measured("frames")

@@ -105,16 +105,22 @@ class Stance:
         """From the cutting edge up to the upper edge."""
         return blade.height_m * math.cos(math.radians(self.attitude.pitch_deg or 0.0))
 
-    def steps(self) -> tuple[int, int, int, int]:
-        """Key under which what follows from the stance is kept."""
+    def stepped(self) -> Stance:
+        """The stance in the middle of its step. What follows from a stance is kept under this one and made from it: it
+        must not hang on which stance of the step came first, or the same frame would be judged in two ways."""
         attitude = self.attitude
-        height, slope, pitch = attitude.height_mm or 0.0, attitude.slope_deg or 0.0, attitude.pitch_deg or 0.0
-        return (
-            round(self.angle_deg / EDGE_ANGLE_STEP_DEG),
-            round(height / EDGE_HEIGHT_STEP_MM),
-            round(slope / EDGE_LEAN_STEP_DEG),
-            round(pitch / EDGE_LEAN_STEP_DEG),
+        return Stance(
+            _stepped(self.angle_deg, EDGE_ANGLE_STEP_DEG) or 0.0,
+            MeasuredAttitude(
+                _stepped(attitude.height_mm, EDGE_HEIGHT_STEP_MM),
+                _stepped(attitude.slope_deg, EDGE_LEAN_STEP_DEG),
+                _stepped(attitude.pitch_deg, EDGE_LEAN_STEP_DEG),
+            ),
         )
+
+
+def _stepped(value: float | None, step: float) -> float | None:
+    return None if value is None else round(value / step) * step
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +169,7 @@ class BladeFinder:
         self._view = view
         self._all_rays = view.rays()
         self._position = view.position_m.astype(np.float32)
-        self._columns: dict[tuple[int, int, int, int], _EdgeColumns | None] = {}
+        self._columns: dict[Stance, _EdgeColumns | None] = {}
         self._blade = blade
         table = np.arange(TABLE_FROM_M, TABLE_TO_M, TABLE_STEP_M)
         self._setback = face_setback_m(blade, table + blade.bottom_z_m).astype(np.float32)
@@ -241,9 +247,9 @@ class BladeFinder:
 
     def _edge_columns(self, stance: Stance) -> _EdgeColumns | None:
         """The pixels in which the upper edge is looked for; None where too few are in the picture."""
-        key = stance.steps()
-        if key in self._columns:
-            return self._columns[key]
+        stance = stance.stepped()
+        if stance in self._columns:
+            return self._columns[stance]
         lens, half = self._view.lens, self._blade.length_m / 2 - TOP_MARGIN_M
         edge = self._on_face(stance, np.linspace(-half, half, TOP_COLUMNS_N), 0.0)
         scale = lens.width / NOMINAL_WIDTH_PX
@@ -258,7 +264,7 @@ class BladeFinder:
             columns = _EdgeColumns(v * lens.width + u, self._all_rays[v, u], *self._body(stance))
         if len(self._columns) >= KEPT_COLUMNS_N:
             self._columns.clear()
-        self._columns[key] = columns
+        self._columns[stance] = columns
         return columns
 
     def _on_face(self, stance: Stance, s: F64, below_m: float) -> F64:

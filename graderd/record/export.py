@@ -49,8 +49,8 @@ def export(recording: Recording, folder: Path) -> dict[str, int]:
                 texts[name].writelines(f"{line}\n" for line in lines)
                 found["log_lines_n"] += len(lines)
     whole.finish()
-    if recording.frames_path.is_file():
-        found["frames_n"] = _export_frames(Recording(recording.frames_path), folder / "frames")
+    if recording.frame_files:
+        found["frames_n"] = _export_frames(recording, folder / "frames")
     return found
 
 
@@ -60,7 +60,12 @@ def _log_line(message: Message) -> str:
 
 
 def raw_frames(recording: Recording) -> Iterator[Judged]:
-    """The raw frames of a recording, whole ones only, oldest first."""
+    """The raw frames of a recording, whole ones only, oldest first: those that lie beside a run, or in it."""
+    for each in [Recording(path) for path in recording.frame_files] or [recording]:
+        yield from _frames_in(each)
+
+
+def _frames_in(recording: Recording) -> Iterator[Judged]:
     frame, color = b"", ""
     waits_for_depth = False
     for message in recording.messages((FRAME, COLOR, DEPTH)):

@@ -57,7 +57,8 @@ class FrameRecorder:
     """Writes one of ``every_n`` frames, on a thread of its own. :meth:`take` never waits."""
 
     def __init__(self, wanted: FramesWanted) -> None:
-        self._wanted = wanted
+        self.wanted = wanted
+        """What it was made for."""
         self._frames: queue.Queue[Judged | None] = queue.Queue(WAITING_N)
         self._seen_n = 0
         self._lost_n = 0
@@ -67,7 +68,7 @@ class FrameRecorder:
     def take(self, judged: Judged) -> None:
         """One more frame was judged."""
         self._seen_n += 1
-        if self._seen_n % self._wanted.every_n:
+        if self._seen_n % self.wanted.every_n:
             return
         try:
             self._frames.put_nowait(judged)
@@ -91,7 +92,7 @@ class FrameRecorder:
                 pass
 
     def _write_all(self) -> None:
-        file = RecordingFile(_free(Path(self._wanted.path)), self._wanted.head, self._wanted.config_json.encode())
+        file = RecordingFile(_free(Path(self.wanted.path)), self.wanted.head, self.wanted.config_json.encode())
         offset_ns = time.time_ns() - time.monotonic_ns()
         due_s, lost_n = 0.0, 0
         while (judged := self._frames.get()) is not None:
@@ -99,7 +100,7 @@ class FrameRecorder:
                 mark = Mark(kind="lost", lost_n=self._lost_n - lost_n, text="frames came faster than they were written")
                 lost_n = self._lost_n
                 file.add(Message(MARK, int(judged.judged_s * 1e9) + offset_ns, mark.model_dump_json().encode()))
-            for message in messages_of(judged, self._wanted.every_n, offset_ns):
+            for message in messages_of(judged, self.wanted.every_n, offset_ns):
                 file.add(message)
             if (now_s := time.monotonic()) >= due_s:
                 due_s = now_s + FLUSH_S

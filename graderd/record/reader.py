@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Metadata
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.summary import Summary
 from pydantic import ValidationError
 
 from graderd.config import Config, ConfigError
@@ -78,14 +79,24 @@ class Recording:
         except ValidationError as error:
             raise ConfigError(self.path, explain(error, Config, where=f"{self.path} {CONFIG}")) from None
 
+    @property
+    def _summary(self) -> Summary | None:
+        try:
+            with self.path.open("rb") as file:
+                return make_reader(file).get_summary()
+        except Exception:  # whatever the library makes of a file without an end
+            return None
+
+    @property
+    def _channels(self) -> dict[int, str]:
+        """Topics by number; empty where the file has no summary."""
+        summary = self._summary
+        return {} if summary is None else {number: channel.topic for number, channel in summary.channels.items()}
+
     @cached_property
     def extent(self) -> Extent:
         """How much it holds, by its summary where there is one."""
-        try:
-            with self.path.open("rb") as file:
-                summary = make_reader(file).get_summary()
-        except Exception:  # whatever the library makes of a file without an end
-            summary = None
+        summary = self._summary
         if summary is not None and summary.statistics is not None and summary.statistics.message_count:
             told = summary.statistics
             return Extent(told.message_start_time, told.message_end_time, told.message_count, True)
@@ -98,22 +109,26 @@ class Recording:
         return Extent(first_ns, max(chunk.message_end_time for chunk in chunks), None, summary is not None)
 
     @property
-    def frames_path(self) -> Path:
-        """Where its raw frames lie, if there are any."""
-        return self.path.with_name(self.path.name.removesuffix(SUFFIX) + FRAMES_SUFFIX)
+    def frame_files(self) -> list[Path]:
+        """Where its raw frames lie: none, one, or more where perception was started anew meanwhile."""
+        stem = self.path.name.removesuffix(SUFFIX)
+        return sorted(self.path.parent.glob(f"{stem}*{FRAMES_SUFFIX}"), key=lambda path: (len(path.name), path.name))
 
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
-        """In the file's order, up to its last whole chunk; ``topics`` None: of all channels."""
-        names: dict[int, str] = {}
+    def messages(self, topics: Collection[str] | None = None, from_ns: int = 0) -> Iterator[Message]:
+        """In the file's order, up to its last whole chunk; ``topics`` None: of all channels. ``from_ns``: not those
+        that were logged before."""
+        # Channels are named where they are first used: only who knows them beforehand may pass over a chunk.
+        names = self._channels if from_ns else {}
+        passes_over = bool(names)
         for record in self._records():
-            if not isinstance(record, Chunk):
+            if not isinstance(record, Chunk) or (passes_over and record.message_end_time < from_ns):
                 continue
             for inner in _inside(record):
                 if isinstance(inner, Channel):
                     names[inner.id] = inner.topic
                 elif isinstance(inner, McapMessage):
                     topic = names[inner.channel_id]
-                    if topics is None or topic in topics:
+                    if (topics is None or topic in topics) and inner.log_time >= from_ns:
                         yield Message(topic, inner.log_time, inner.data)
 
     def _records(self) -> Iterator[Any]:

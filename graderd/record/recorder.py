@@ -348,7 +348,7 @@ class _Files:
         self._run = self._begin("run", SUFFIX, messages)
         self._part_n += 1
         if self._every_n:
-            frames, head = _frames_of(self._run.path), {**self._head, "kind": "frames"}
+            frames, head = _frames_of(self._run.path), {**self._head, "kind": "frames", "every_n": str(self._every_n)}
             wanted = FramesWanted(
                 path=str(frames), every_n=self._every_n, head=head, config_json=self._config_json.decode()
             )

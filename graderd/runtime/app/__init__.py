@@ -6,6 +6,7 @@ The functions import what they need when called, so that ``graderd --help`` and 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,15 @@ def run_guard(config_path: Path | None) -> int:
     from graderd.runtime.app.guard import run_guard as run
 
     return run(config_path)
+
+
+def serve_recording(
+    path: Path, socket: Path, port_n: int | None, speed: float, from_s: float, ready: Callable[[float], None]
+) -> None:
+    """See :func:`graderd.runtime.app.replay_server.serve_recording`."""
+    from graderd.runtime.app.replay_server import serve_recording as run
+
+    run(path, socket, port_n, speed, from_s, ready)
 
 
 def problems(config: Config) -> list[str]:

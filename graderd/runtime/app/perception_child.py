@@ -166,7 +166,9 @@ class Worker:
                 self._send(Preview(capture_s=frame.capture_s, jpeg_base64=_jpeg(classifier, frame, observation)))
 
     def _record(self, wanted: FramesWanted) -> None:
-        """On the thread that listens: files are begun and ended beside the judging."""
+        """On the thread that listens: files are begun and ended beside the judging. It may be told twice."""
+        if self._recorder is not None and self._recorder.wanted == wanted:
+            return
         former, self._recorder = self._recorder, None
         if former is not None:
             former.end()

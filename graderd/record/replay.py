@@ -1,0 +1,315 @@
+"""Recorded inputs through today's perception and tick: what would be decided otherwise, worst first.
+
+With the recording's own configuration this is a regression test: the same code gives the same bytes. With another one
+it is a what-if, as far as one can be: what was recorded does not answer to what is decided anew.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from graderd.config import Config
+from graderd.config.tick import tick_settings
+from graderd.core.axes import AXES, UNITS
+from graderd.core.machine import State
+from graderd.core.soil import SoilObservation
+from graderd.core.tick import Controller, Sensed
+from graderd.hal.errors import ProtocolError
+from graderd.perception.classifier import judge_frame, make_classifier
+from graderd.record.export import raw_frames
+from graderd.record.layout import (
+    MARK,
+    MEMORY,
+    SENSED,
+    TICK,
+    Mark,
+    Memory,
+    controller_of,
+    memory_of,
+    sensed_bytes,
+    sensed_of,
+    tick_bytes,
+    tick_of,
+)
+from graderd.record.reader import Recording
+
+WARM_UP_S: Final = 10.0
+"""Where the tick's memory is another version's, it is made anew from the state recorded, and not judged for so long:
+faults have their debounce and votes their age by then."""
+KINDS: Final = ("command", "decision", "picture", "mode", "fault", "other")
+"""What may differ, worst first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Something that is decided otherwise today, in ``ticks_n`` ticks on end from ``at_s`` (monotonic).
+
+    ``kind``: of :data:`KINDS`. ``size``: within a kind, the greater the worse: degrees or millimetres of a command.
+    ``text``: for people. ``frame_number``: the picture's, where it is about one.
+    """
+
+    kind: str
+    where: str
+    at_s: float
+    log_ns: int
+    ticks_n: int
+    size: float
+    recorded: str
+    today: str
+    text: str
+    frame_number: int | None = None
+
+    @property
+    def order(self) -> tuple[int, float]:
+        """Worst first."""
+        return KINDS.index(self.kind), -self.size
+
+
+@dataclass(slots=True)
+class Check:
+    """What a check has found: ``ticks_n`` were decided again, ``skipped_n`` could not be (no memory to begin with)."""
+
+    ticks_n: int = 0
+    skipped_n: int = 0
+    frames_n: int = 0
+    warm_ups_n: int = 0
+    differences: tuple[Difference, ...] = ()
+
+
+def check(recording: Recording, config: Config | None = None) -> Check:
+    """Decide everything again; ``config``: by another configuration than the recording's.
+
+    Raises:
+        ConfigError: the recording's configuration is not one any more.
+        ProtocolError: what the tick knew is not what today's tick could know.
+    """
+    found = Check()
+    used = config or recording.config
+    pictures, differences = _pictures(recording, used, found)
+    differences += list(_merged(_decide(recording, used, found, pictures, follows=config is None)))
+    found.differences = tuple(sorted(differences, key=lambda difference: difference.order))
+    return found
+
+
+# ---- perception ------------------------------------------------------------------------------------------------------
+
+
+def _pictures(
+    recording: Recording, config: Config, found: Check
+) -> tuple[dict[int, SoilObservation], list[Difference]]:
+    """Today's observations by frame number, and how they differ. Without raw frames there are none."""
+    today: dict[int, SoilObservation] = {}
+    differences: list[Difference] = []
+    classifier = make_classifier(config.perception, config.camera.calibration, config.blade, camera=config.camera)
+    for judged in raw_frames(recording):
+        seen = judge_frame(
+            classifier,
+            judged.frame,
+            judged.angle_deg,
+            judged.angle_age_s,
+            judged.judged_s,
+            config.perception.decision,
+            judged.attitude,
+        )
+        was = judged.observation
+        # How long it took is no part of what was seen; the recorded time keeps what follows comparable.
+        seen = replace(seen, cpu_ms=was.cpu_ms)
+        found.frames_n += 1
+        today[was.frame_number] = seen
+        if seen != was:
+            differences.append(_picture(was, seen))
+    return today, differences
+
+
+def _picture(was: SoilObservation, now: SoilObservation) -> Difference:
+    before, after = was.coming, now.coming
+    size = abs(after.confidence - before.confidence) + (1.0 if before.zone is not after.zone else 0.0)
+    return Difference(
+        "picture",
+        f"frame {was.frame_number}",
+        was.capture_s,
+        0,
+        1,
+        size,
+        f"{before.zone} ({before.confidence:.2f}): {before.reason}",
+        f"{after.zone} ({after.confidence:.2f}): {after.reason}",
+        f"frame {was.frame_number}: {before.zone} {before.confidence:.0%} sure was seen, today {after.zone} "
+        f"{after.confidence:.0%}",
+        was.frame_number,
+    )
+
+
+# ---- the tick --------------------------------------------------------------------------------------------------------
+
+
+def _decide(
+    recording: Recording, config: Config, found: Check, pictures: Mapping[int, SoilObservation], *, follows: bool
+) -> Iterator[Difference]:
+    """Every difference of every tick. ``follows``: each memory is taken up, so that one difference is not told for the
+    rest of the day; a what-if goes its own way."""
+    settings = tick_settings(config)
+    controller: Controller | None = None
+    knew = b""
+    warm_until_s = float("-inf")
+    cold = False
+    for message in recording.messages((SENSED, TICK, MEMORY, MARK)):
+        if message.topic == SENSED:
+            knew = message.data
+        elif message.topic == MARK:
+            if Mark.model_validate_json(message.data).kind == "lost":
+                controller = None
+        elif message.topic == MEMORY:
+            if controller is not None and not follows:
+                continue
+            memory = Memory.model_validate_json(message.data)
+            try:
+                controller = controller_of(memory.controller, settings)
+            except ValueError:
+                cold = controller is None
+        elif controller is None:
+            found.skipped_n += 1
+            if cold:  # the state of this tick is all there is to begin with
+                controller, cold = Controller(settings, _state(message.data)), False
+                warm_until_s = float(json.loads(message.data)["now_s"]) + WARM_UP_S
+                found.warm_ups_n += 1
+        else:
+            try:
+                sensed = sensed_of(knew)
+            except ValueError as error:
+                cause = f"what the tick knew is of another version ({str(error).splitlines()[0]})"
+                raise ProtocolError(str(recording.path), cause, "Replay it with the version in its head") from None
+            sensed = _seen_today(sensed, pictures, config)
+            told = tick_bytes(controller.step(sensed))
+            if sensed.now_s < warm_until_s:
+                found.skipped_n += 1
+                continue
+            found.ticks_n += 1
+            if told != message.data:
+                some = _differences(json.loads(message.data), json.loads(told), message.log_ns)
+                # Counters and ages began anew where the memory did.
+                yield from (each for each in some if not (found.warm_ups_n and each.kind == "other"))
+
+
+def _seen_today(sensed: Sensed, pictures: Mapping[int, SoilObservation], config: Config) -> Sensed:
+    """What the tick would have known, had today's perception seen the pictures."""
+    if sensed.observation is None or (seen := pictures.get(sensed.observation.frame_number)) is None:
+        return sensed
+    return replace(sensed, observation=seen.as_of(sensed.now_s, config.perception.decision.max_frame_age_s))
+
+
+def _state(tick: bytes) -> State | None:
+    try:
+        return tick_of(tick).state
+    except ValueError:  # another version's
+        return None
+
+
+def _differences(was: dict[str, Any], now: dict[str, Any], log_ns: int) -> Iterator[Difference]:
+    """What differs in one tick; everything beyond commands, decision, mode and faults only where nothing else does."""
+
+    def told(kind: str, where: str, size: float, recorded: str, today: str, text: str) -> Difference:
+        return Difference(kind, where, now["now_s"], log_ns, 1, size, recorded, today, text)
+
+    any_told = False
+    for axis in AXES:
+        before, after = was["axes"].get(axis, {}), now["axes"].get(axis, {})
+        if before.get("send") == after.get("send") and before.get("hold") == after.get("hold"):
+            continue
+        any_told = True
+        measured = now["pose"].get(_POSE[axis])
+        verb = "turned" if axis == "rotation" else "moved"
+        recorded, today = _order(before, axis), _order(after, axis)
+        text = f"{axis}: {recorded} was sent, today {today}"
+        if before.get("send") is None and after.get("send") is not None:
+            text = f"{axis}: would have {verb} to {after['send']:.2f} {UNITS[axis]}, {recorded}"
+        elif after.get("send") is None and before.get("send") is not None:
+            text = f"{axis}: would not have {verb}; it was sent to {before['send']:.2f} {UNITS[axis]}"
+        yield told("command", axis, _size(before, after, measured), recorded, today, text)
+    decided, decides = (tick["state"].get("decision", {}) for tick in (was, now))
+    if any(decided.get(key) != decides.get(key) for key in ("zone", "angle_deg")):
+        any_told = True
+        recorded, today = (f"{d.get('zone', 'none')} ({d.get('angle_deg', '-')} deg)" for d in (decided, decides))
+        size = abs((decides.get("angle_deg") or 0.0) - (decided.get("angle_deg") or 0.0))
+        yield told("decision", "decision", size, recorded, today, f"decided {recorded}, today {today}")
+    if was["state"]["mode"] != now["state"]["mode"]:
+        any_told = True
+        recorded, today = (f"{tick['state']['mode']}: {tick['state']['reason']}" for tick in (was, now))
+        yield told("mode", "mode", 1.0, recorded, today, f"mode {recorded}; today {today}")
+    names = [{fault["name"] for fault in tick["faults"]} for tick in (was, now)]
+    if names[0] != names[1]:
+        any_told = True
+        recorded, today = (", ".join(sorted(some)) or "none" for some in names)
+        yield told("fault", "faults", len(names[0] ^ names[1]), recorded, today, f"faults {recorded}; today {today}")
+    if not any_told:
+        places = [key for key in {**was, **now} if was.get(key) != now.get(key)]
+        where = ", ".join(sorted(places)) or "the order of fields"
+        yield told("other", "tick", 0.0, "", "", f"other words or numbers in {where}")
+
+
+_POSE: Final = {
+    "rotation": "rotation_deg",
+    "lift_left": "lift_left_mm",
+    "lift_right": "lift_right_mm",
+    "tilt": "tilt_mm",
+}
+
+
+def _order(axis: Mapping[str, Any], name: str) -> str:
+    if axis.get("send") is not None:
+        return f"{axis['send']:.4g} {UNITS[name]}"
+    return "a hold" if axis.get("hold") else "nothing"
+
+
+def _size(before: Mapping[str, Any], after: Mapping[str, Any], measured: float | None) -> float:
+    """How far apart the two orders lead; an axis that is sent nowhere stays where it is."""
+    stays = 0.0 if measured is None else measured
+    goals = [stays if order.get("send") is None else order["send"] for order in (before, after)]
+    return float(abs(goals[1] - goals[0]))
+
+
+def _merged(differences: Iterator[Difference]) -> Iterator[Difference]:
+    """Those of one kind and place in ticks on end as one, with the words of its worst tick."""
+    going: dict[tuple[str, str], tuple[Difference, float]] = {}
+    for each in differences:
+        key = (each.kind, each.where)
+        former = going.get(key)
+        if former is not None and each.at_s - former[1] < 0.5:
+            first, _ = former
+            worst = each if each.size > first.size else first
+            going[key] = (replace(worst, at_s=first.at_s, log_ns=first.log_ns, ticks_n=first.ticks_n + 1), each.at_s)
+        else:
+            if former is not None:
+                yield former[0]
+            going[key] = (each, each.at_s)
+    yield from (each for each, _ in going.values())
+
+
+def decided_again(recording: Recording) -> Iterator[tuple[str, int, bytes]]:
+    """The recording's messages with what today is seen and decided in place of what was: a new reference.
+
+    Raises:
+        ProtocolError: as :func:`check`.
+    """
+    settings = tick_settings(recording.config)
+    pictures, _ = _pictures(recording, recording.config, Check())
+    controller: Controller | None = None
+    sensed = None
+    for message in recording.messages():
+        data = message.data
+        if message.topic == SENSED:
+            sensed = _seen_today(sensed_of(data), pictures, recording.config)
+            data = sensed_bytes(sensed)
+        elif message.topic == MEMORY:
+            memory = Memory.model_validate_json(data)
+            if controller is None:
+                try:
+                    controller = controller_of(memory.controller, settings)
+                except ValueError:
+                    controller = Controller(settings)
+            data = Memory(now_s=memory.now_s, controller=memory_of(controller, settings)).model_dump_json().encode()
+        elif message.topic == TICK and controller is not None and sensed is not None:
+            data = tick_bytes(controller.step(sensed))
+        yield message.topic, message.log_ns, data
