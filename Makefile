@@ -26,7 +26,7 @@ BESIDE := -n 2 --dist loadgroup
 # A third of the tests' time is waiting, for virtual devices that move in real time.
 WAITING := -n 3 --dist loadgroup
 
-.PHONY: help run test unit quick passes peers test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb bench-hw check format lock clean mutants mutants-wide claims core-coverage
+.PHONY: help run test unit quick passes peers test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb web-test web-lock bench-hw check format lock clean mutants mutants-wide claims core-coverage
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
@@ -135,6 +135,11 @@ hil-usb: $(STAMP) ## QEMU: an FTDI adapter pulled and plugged, two SJA1000 contr
 	@$(MAKE) --no-print-directory deb
 	@PYTHONPATH=. $(BIN)/python -m hil.usb $(HIL_ARGS)
 
+web-test: $(STAMP) ## the operator page in a headless Chromium, on rig and daemon (installs Debian's chromium once, as root)
+	@tests/browser/setup
+	@$(INSTALL) --require-hashes -r tests/browser/requirements.txt >$(LOG) 2>&1 || $(because)
+	@$(TESTS) -o addopts="-ra --strict-markers --strict-config" $(PYTEST_ARGS) tests/browser
+
 bench-hw: $(STAMP) ## tests against real hardware; asks before each motion (needs GRADERD_BENCH=1 and a terminal)
 	@PYTHONPATH=. $(BIN)/python -m hil.bench $(BENCH_ARGS)
 
@@ -167,6 +172,9 @@ format: $(STAMP) ## apply the formatter and the safe fixes
 
 lock: $(LOCKED) ## pin what pyproject.toml names; pins in force stay (LOCK_ARGS="--upgrade-package numpy", --upgrade for all)
 	@$(BIN)/uv pip compile --universal --python-version 3.11 --all-extras --generate-hashes --custom-compile-command "make lock" --quiet --output-file requirements.lock $(LOCK_ARGS) pyproject.toml
+
+web-lock: $(LOCKED) ## pin what tests/browser/requirements.in names (LOCK_ARGS as for lock)
+	@$(BIN)/uv pip compile --universal --python-version 3.11 --generate-hashes --custom-compile-command "make web-lock" --quiet --constraint requirements.lock --output-file tests/browser/requirements.txt $(LOCK_ARGS) tests/browser/requirements.in
 
 clean: ## remove what the targets above made
 	rm -rf $(VENV) $(PYTHONS:%=.venv-%) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

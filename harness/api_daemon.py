@@ -119,7 +119,8 @@ class FakeDaemon:
     def config(self) -> dict[str, Any]:
         return {"machine": self.settings.model_dump(mode="json"), "rig": {"port": Path("/dev/null").name}}
 
-    async def preview_jpeg(self) -> tuple[bytes, float]:
+    async def preview_jpeg(self, *, labels: bool = True, width_px: int | None = None) -> tuple[bytes, float]:
+        del labels, width_px
         if self.picture is None:
             raise ServiceError("no picture yet", "look at the camera's cable")
         return self.picture, 0.25

@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 
 from graderd.api.http_routes import StatusTexts, http_routes
 from graderd.api.limiter import Closing, Limiter
+from graderd.api.page import page_routes
 from graderd.api.port import DaemonPort
 from graderd.api.problem import Problem, ProblemError, problem_of_validation
 from graderd.api.session import session_routes
@@ -56,6 +57,7 @@ def make_app(port: DaemonPort, limits: ApiLimits | None = None) -> FastAPI:
     app.include_router(http_routes(port, limits, texts, app.state.stops))
     app.include_router(socket_routes(port, limits, texts, app.state.closing, app.state.stops))
     app.include_router(session_routes())
+    app.include_router(page_routes())
     app.add_middleware(Limiter, limits=limits, closing=app.state.closing)
     for kind, handler in _handlers().items():
         app.add_exception_handler(kind, handler)

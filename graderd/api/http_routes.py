@@ -6,9 +6,10 @@ import asyncio
 import logging
 from collections import OrderedDict
 from collections.abc import Coroutine
+from enum import IntEnum
 from typing import Annotated, Any, TypeVar
 
-from fastapi import APIRouter, Body, Path, Request, Response
+from fastapi import APIRouter, Body, Path, Query, Request, Response
 from pydantic import BaseModel, Field, StrictBool, create_model
 from starlette.requests import HTTPConnection
 
@@ -78,6 +79,15 @@ STOP_BODY: dict[str, Any] = {
 }
 
 
+class Width(IntEnum):
+    """Few, so that many who look on share the same pictures."""
+
+    W320 = 320
+    W480 = 480
+    W640 = 640
+    W960 = 960
+
+
 class StatusTexts:
     """The newest status as JSON, made once however many clients look on."""
 
@@ -134,9 +144,12 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: 
             404: {"model": Problem, "description": "no picture yet"},
         },
     )
-    async def preview() -> Response:
+    async def preview(
+        labels: Annotated[bool, Query(description="with names and numbers in the picture, not lines alone")] = True,
+        width_px: Annotated[Width | None, Query(description="no wider than that; none: as the camera gives it")] = None,
+    ) -> Response:
         try:
-            picture, age_s = await port.preview_jpeg()
+            picture, age_s = await port.preview_jpeg(labels=labels, width_px=width_px)
         except ServiceError as error:
             raise ProblemError(404, error.message, "preview", error.remedy) from error
         return Response(

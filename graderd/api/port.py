@@ -42,8 +42,9 @@ class DaemonPort(Protocol):
         """The resolved configuration."""
         ...
 
-    async def preview_jpeg(self) -> tuple[bytes, float]:
-        """The newest annotated picture, and its age in seconds.
+    async def preview_jpeg(self, *, labels: bool = True, width_px: int | None = None) -> tuple[bytes, float]:
+        """The newest annotated picture, and its age in seconds. ``labels``: with names and numbers in it; ``width_px``:
+        no wider than that.
 
         Raises:
             ServiceError: there is none.

@@ -13,6 +13,7 @@ from graderd.cli import (
     can,
     classify,
     config,
+    doctor,
     evaluate,
     explain,
     modes,
@@ -47,6 +48,7 @@ COMMANDS = (
     evaluate,
     calibrate,
     token,
+    doctor,
 )
 
 

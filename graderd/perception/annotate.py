@@ -38,9 +38,16 @@ def image_right_is_left(mounting: Mounting) -> bool:
 
 
 def annotate(
-    image_bgr: U8, observation: SoilObservation, view: View | None, blade: BladeGeometry, mirrored: bool
+    image_bgr: U8,
+    observation: SoilObservation,
+    view: View | None,
+    blade: BladeGeometry,
+    mirrored: bool,
+    *,
+    labels: bool = True,
 ) -> U8:
-    """A copy of the picture with the observation drawn into it; without ``view`` the thirds are the picture's own."""
+    """A copy of the picture with the observation drawn into it; without ``view`` the thirds are the picture's own.
+    Without ``labels`` there is no text in it: whoever shows it may mirror it, and writes beside it."""
     picture = image_bgr.copy()
     height, width = picture.shape[:2]
     scale = max(width / 1280, 0.35)
@@ -57,13 +64,14 @@ def annotate(
         if np.isfinite(outline).all():
             cv2.polylines(picture, [np.round(outline).astype(np.int32)], True, COLORS[third], line, cv2.LINE_AA)
     for third, outline in enumerate(outlines):
-        if np.isfinite(outline).all():
+        if labels and np.isfinite(outline).all():
             _label(picture, outline, third, observation, scale)
     if view is not None:
         edge = view.project(top_edge_m(blade, observation.blade_angle_deg))
         if np.isfinite(edge).all():
             cv2.polylines(picture, [np.round(edge).astype(np.int32)], False, WHITE, line, cv2.LINE_AA)
-    _banner(picture, observation, scale)
+    if labels:
+        _banner(picture, observation, scale)
     return picture
 
 

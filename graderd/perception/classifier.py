@@ -60,8 +60,9 @@ class Classifier(Protocol):
         """
         ...
 
-    def annotate(self, frame: Frame, observation: SoilObservation) -> U8:
-        """The colour picture (BGR) with thirds, LEFT and RIGHT, numbers and decision drawn into it."""
+    def annotate(self, frame: Frame, observation: SoilObservation, *, labels: bool = True) -> U8:
+        """The colour picture (BGR) with the thirds drawn into it, and with ``labels`` LEFT and RIGHT, numbers and
+        decision."""
         ...
 
 
@@ -127,11 +128,11 @@ class SoilClassifier:
             judged = judged.unknown(f"the blade angle was {blade_angle_age_s:.2f} s old at capture")
         return self._observation(frame, judged, blade_angle_deg, blade_angle_age_s, faults, start_s)
 
-    def annotate(self, frame: Frame, observation: SoilObservation) -> U8:
+    def annotate(self, frame: Frame, observation: SoilObservation, *, labels: bool = True) -> U8:
         """See :class:`Classifier`."""
-        view = self.color_view(frame)
+        mirrored = drawing.image_right_is_left(self._mounting)
         return drawing.annotate(
-            frame.color_bgr, observation, view, self._blade, drawing.image_right_is_left(self._mounting)
+            frame.color_bgr, observation, self.color_view(frame), self._blade, mirrored, labels=labels
         )
 
     def color_view(self, frame: Frame) -> View | None:

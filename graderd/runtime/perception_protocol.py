@@ -54,10 +54,19 @@ class Angle(_Message):
         return MeasuredAttitude(self.height_mm, self.slope_deg, self.pitch_deg)
 
 
+class Look(_Message):
+    """How a picture is wanted. ``labels``: with names and numbers in it, else lines alone, for whoever writes them
+    beside it and may mirror it. ``width_px``: no wider than that; None: as the camera gives it."""
+
+    labels: bool = True
+    width_px: int | None = None
+
+
 class PreviewRequest(_Message):
     """Send the next frame's annotated picture."""
 
     kind: Literal["preview"] = "preview"
+    look: Look = Look()
 
 
 class SaveFrame(_Message):
@@ -138,6 +147,7 @@ class Preview(_Message):
     """An annotated picture, JPEG, base64; ``capture_s``: monotonic, when it was taken."""
 
     kind: Literal["preview"] = "preview"
+    look: Look
     capture_s: float
     jpeg_base64: str
 

@@ -33,6 +33,7 @@ from graderd.runtime.perception_protocol import (
     Angle,
     CameraProblem,
     FromChild,
+    Look,
     Observed,
     Opened,
     Preview,
@@ -60,6 +61,8 @@ MAX_UNSENT_BYTES = 64 * 1024
 
 log = logging.getLogger(__name__)
 _FIELDS = {"device": "camera"}
+
+AS_IT_IS = Look()
 
 
 class PerceptionSupervisor:
@@ -97,7 +100,7 @@ class PerceptionSupervisor:
         self._opens_without_frame_n = 0
         self._restarts_n = 0
         self._frame_times: deque[float] = deque(maxlen=30)
-        self._preview: asyncio.Future[Reading[bytes]] | None = None
+        self._previews: dict[Look, asyncio.Future[Reading[bytes]]] = {}
         self._saved: asyncio.Future[Saved] | None = None
         self._frames = FramesWanted()
 
@@ -170,17 +173,18 @@ class PerceptionSupervisor:
         """Tell the child the measured blade angle and attitude; dropped while the child does not read."""
         self._write(Angle(angle_deg=angle_deg, time_s=time_s, **asdict(attitude)))
 
-    async def preview_jpeg(self, timeout_s: float = 3.0) -> Reading[bytes]:
-        """The next frame's annotated picture, and when it was taken.
+    async def preview_jpeg(self, look: Look = AS_IT_IS, timeout_s: float = 3.0) -> Reading[bytes]:
+        """The next frame's annotated picture, and when it was taken; who asks for the same look gets the same.
 
         Raises:
             TimeoutError: none came.
         """
-        if self._preview is None or self._preview.done():
-            self._preview = asyncio.get_running_loop().create_future()
-            self._write(PreviewRequest())
+        preview = self._previews.get(look)
+        if preview is None or preview.done():
+            preview = self._previews[look] = asyncio.get_running_loop().create_future()
+            self._write(PreviewRequest(look=look))
         async with asyncio.timeout(timeout_s):
-            return await asyncio.shield(self._preview)
+            return await asyncio.shield(preview)
 
     async def save_frame(self, folder: Path, id_: str, blade_angle_deg: float, timeout_s: float = 5.0) -> None:
         """Have the next frame added to the frame set in ``folder``.
@@ -315,8 +319,10 @@ class PerceptionSupervisor:
         elif isinstance(message, Saved):
             if self._saved is not None and not self._saved.done():
                 self._saved.set_result(message)
-        elif self._preview is not None and not self._preview.done():
-            self._preview.set_result(Reading(base64.b64decode(message.jpeg_base64), message.capture_s))
+        else:
+            preview = self._previews.pop(message.look, None)
+            if preview is not None and not preview.done():
+                preview.set_result(Reading(base64.b64decode(message.jpeg_base64), message.capture_s))
         return True
 
     async def _kill(self) -> None:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import functools
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
+import cv2
 import numpy as np
 import pytest
 
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Zone
-from graderd.hal.camera import Frame
+from graderd.hal.camera import Frame, Intrinsics
 from graderd.perception import METHODS, CameraCalibration, Method, PerceptionSettings
 from graderd.perception.classifier import make_classifier
+from graderd.runtime.app.perception_child import no_wider
 from harness.perception_scenes import Scene, render
 
 PILES = [Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN, Zone.NONE]
@@ -66,6 +68,25 @@ def test_annotation_leaves_the_frame_alone(method: Method) -> None:
     assert drawn.shape == before.shape
     assert np.array_equal(frame.color_bgr, before)
     assert not np.array_equal(drawn, before)
+
+
+def test_a_smaller_picture_has_its_thirds_in_the_same_places_and_no_text() -> None:
+    """The lens that a frame comes with is of its own size: drawn by the large one's, lines would lie elsewhere."""
+    classifier = make_classifier(PerceptionSettings(), CameraCalibration(), BladeGeometry())
+    frame = picture(Zone.RIGHT)
+    frame = replace(frame, color_intrinsics=Intrinsics(480, 300, 235.9, 235.9, 239.5, 149.5))
+    said = classifier.classify(frame, -15.0, 0.0)
+    blank = replace(frame, color_bgr=np.zeros_like(frame.color_bgr))
+    large = classifier.annotate(blank, said, labels=False)
+    small = classifier.annotate(no_wider(blank, 240), said, labels=False)
+    assert small.shape == (150, 240, 3)
+    lines = [
+        np.asarray(cv2.resize(drawn, (120, 75), interpolation=cv2.INTER_AREA)).max(axis=2) > 12
+        for drawn in (large, small)
+    ]
+    assert lines[0].any()
+    assert (lines[0] & lines[1]).sum() > 0.85 * (lines[0] | lines[1]).sum()
+    assert not np.array_equal(large, classifier.annotate(blank, said))
 
 
 @pytest.mark.parametrize("method", METHODS)

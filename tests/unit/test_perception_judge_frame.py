@@ -35,7 +35,7 @@ class Always:
         self.asked.append(blade_angle_age_s)
         return SoilObservation(frame.capture_s, Zone.LEFT, 1.0, "", blade_angle_age_s=blade_angle_age_s)
 
-    def annotate(self, frame: Frame, observation: SoilObservation) -> U8:
+    def annotate(self, frame: Frame, observation: SoilObservation, *, labels: bool = True) -> U8:
         return frame.color_bgr
 
 

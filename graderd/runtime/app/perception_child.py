@@ -14,13 +14,16 @@ import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
 import cv2
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from graderd.core.attitude import UNMEASURED, MeasuredAttitude
+from graderd.core.soil import SoilObservation
 from graderd.hal.camera import Camera, EndOfFrames, Frame
 from graderd.hal.errors import DeviceError, DeviceTimeoutError
 from graderd.hal.settings import DEPTH_PRESETS, CameraSettings
@@ -32,6 +35,7 @@ from graderd.runtime.app.frame_sources import open_camera
 from graderd.runtime.perception_protocol import (
     Angle,
     CameraProblem,
+    Look,
     Observed,
     Opened,
     Preview,
@@ -85,7 +89,7 @@ class Worker:
         self._angles = AngleHistory()
         self._attitude = UNMEASURED
         """The newest: lifts and tilt move a millimetre between frames."""
-        self._preview_wanted = threading.Event()
+        self._looks: queue.SimpleQueue[Look] = queue.SimpleQueue()
         self._to_save: queue.SimpleQueue[SaveFrame] = queue.SimpleQueue()
         self._writers: dict[str, FrameSetWriter] = {}
         self._recorder: FrameRecorder | None = None
@@ -106,7 +110,7 @@ class Worker:
             elif isinstance(message, RecordFrames):
                 self._record(message.wanted)
             else:
-                self._preview_wanted.set()
+                self._looks.put(message.look)
         os._exit(0)
 
     def run(self) -> int:
@@ -161,9 +165,10 @@ class Worker:
                 recorder.take(Judged(frame, angle_deg, age_s, attitude, judged_s, observation))
             if not self._to_save.empty():
                 self._save(self._to_save.get(), frame, attitude)
-            if self._preview_wanted.is_set():
-                self._preview_wanted.clear()
-                self._send(Preview(capture_s=frame.capture_s, jpeg_base64=_jpeg(classifier, frame, observation)))
+            while not self._looks.empty():
+                look = self._looks.get()
+                jpeg = _jpeg(classifier, frame, observation, look)
+                self._send(Preview(look=look, capture_s=frame.capture_s, jpeg_base64=jpeg))
 
     def _record(self, wanted: FramesWanted) -> None:
         """On the thread that listens: files are begun and ended beside the judging. It may be told twice."""
@@ -187,10 +192,22 @@ class Worker:
         self._send(Saved(id=wanted.id, problem=problem))
 
 
-def _jpeg(classifier: Classifier, frame: Frame, observation: object) -> str:
-    picture = classifier.annotate(frame, observation)  # type: ignore[arg-type]  # same observation as just made
+def _jpeg(classifier: Classifier, frame: Frame, observation: SoilObservation, look: Look) -> str:
+    # Made smaller before anything is drawn: lines stay sharp, and a small picture costs little.
+    picture = classifier.annotate(no_wider(frame, look.width_px), observation, labels=look.labels)
     ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return base64.b64encode(data.tobytes()).decode() if ok else ""
+
+
+def no_wider(frame: Frame, width_px: int | None) -> Frame:
+    """The frame with a colour picture of at most that width, and the lens that this one would come from."""
+    height, width = frame.color_bgr.shape[:2]
+    if width_px is None or width_px >= width:
+        return frame
+    size = (width_px, round(height * width_px / width))
+    small = np.asarray(cv2.resize(frame.color_bgr, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    lens = frame.color_intrinsics
+    return replace(frame, color_bgr=small, color_intrinsics=lens and lens.scaled(*size))
 
 
 def settings_not_kept(settings: CameraSettings, read_back: dict[str, float]) -> tuple[str, ...]:
