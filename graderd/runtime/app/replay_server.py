@@ -207,8 +207,9 @@ class Player:
         """The recording's."""
         return self._config.model_dump(mode="json")
 
-    async def preview_jpeg(self) -> tuple[bytes, float]:
-        """The picture of this moment."""
+    async def preview_jpeg(self, *, labels: bool = True, width_px: int | None = None) -> tuple[bytes, float]:
+        """The picture of this moment, as it was recorded."""
+        del labels, width_px
         if self._picture is None:
             raise ServiceError("no picture was recorded so far", "play on")
         data, taken_s = self._picture
