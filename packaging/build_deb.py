@@ -265,7 +265,7 @@ def place_files(package: Package) -> None:
     write_gzip(package.tree / "usr/share/man/man1/graderd.1.gz", (DEBIAN.parent / "graderd.1").read_bytes())
     write_gzip(package.tree / "usr/share/doc/graderd/changelog.gz", (PROJECT / "CHANGELOG.md").read_bytes())
     template = package.tree / "usr/share/graderd/graderd.toml"
-    run(sys.executable, DEBIAN.parent / "config_template.py", template)
+    run(sys.executable, "-m", "graderd.config.template", template)
     for shell, place in (
         ("bash", "usr/share/bash-completion/completions/graderd"),
         ("zsh", "usr/share/zsh/vendor-completions/_graderd"),

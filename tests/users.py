@@ -53,7 +53,7 @@ tmpfiles() {{
     done <{project}/systemd/graderd.tmpfiles
 }}
 tmpfiles
-{python} {project}/packaging/config_template.py {config}
+{python} -m graderd.config.template {config}
 tmpfiles
 install -d -m {runtime_mode} -o graderd -g graderd /run/graderd
 install -d -m {state_mode} -o graderd -g graderd {state}

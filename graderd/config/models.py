@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from graderd.api.settings import ApiLimits, TcpSettings
-from graderd.core.attitude import AttitudeGeometry, Preset
-from graderd.core.axes import AxisFigures
+from graderd.core.attitude import Attitude, AttitudeGeometry, Preset, lift_extensions, tilt_extension
+from graderd.core.axes import UNITS, AxisFigures
 from graderd.core.blade import BladeGeometry
 from graderd.core.gate import GateSettings
 from graderd.core.lift_pair import LiftPairSettings
@@ -193,6 +193,25 @@ class Config(Settings):
     vehicle: VehicleSettings = Field(default_factory=VehicleSettings)
     presets: dict[str, Preset] = Field(default_factory=_presets)
 
+    def _beyond_presets(self) -> Iterator[str]:
+        """Poses that cannot be taken up, of those that the file names: the built-in ones are told when they are asked
+        for, so that narrow limits for first motions need no other poses."""
+        if "presets" not in self.model_fields_set:
+            return
+        figures = self.figures()
+        for name, preset in self.presets.items():
+            goals: dict[str, float | None] = {"rotation": preset.rotation_deg}
+            if preset.height_mm is not None:
+                wanted = Attitude(preset.height_mm, preset.slope_deg or 0.0)
+                goals["lift_left"], goals["lift_right"] = lift_extensions(self.attitude, wanted)
+            if preset.pitch_deg is not None:
+                goals["tilt"] = tilt_extension(self.attitude, preset.pitch_deg)
+            for axis, value in goals.items():
+                low, high = figures[axis].low, figures[axis].high
+                if value is not None and not low <= value <= high:
+                    unit = UNITS[axis]
+                    yield f"presets.{name} needs {axis} at {value:.1f} {unit}, outside its {low:g} to {high:g} {unit}"
+
     @model_validator(mode="after")
     def _consistent(self) -> Config:
         electraks = {name: axis for name, axis in self.actuators().items() if isinstance(axis, ElectrakSettings)}
@@ -218,6 +237,8 @@ class Config(Settings):
                 f"all lie within rule.vote_max_age_s ({age_s:g}): automatic operation could not decide anything. Raise "
                 f"the one or the other until their product is {needed_n - 1} or more"
             )
+        for problem in self._beyond_presets():
+            raise ValueError(problem)
         for problem in self._unkept():
             raise ValueError(problem)
         return self

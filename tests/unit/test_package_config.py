@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import pytest
 
 from graderd.config import Config, ConfigError, load, parse
 from graderd.config.migrate import CURRENT_VERSION, Document, migrate_file, migrate_text, rename
+from graderd.config.template import template
 from graderd.core.axes import ACTUATORS
 from graderd.hal.settings import ElectrakSettings, Ph54Settings
 
@@ -89,10 +88,9 @@ def test_steps_run_in_order_up_to_the_present_version() -> None:
     assert changes == ["a.x is now b.x", "b.x is now b.y_deg"]
 
 
-@pytest.mark.live
 def test_the_installed_file_names_every_key_and_gives_the_defaults(tmp_path: Path) -> None:
     path = tmp_path / "graderd.toml"
-    subprocess.run([sys.executable, PROJECT / "packaging" / "config_template.py", path], check=True)
+    path.write_text(template(), encoding="utf-8")
     config = load(path)
     assert config.recording.directory == "/var/lib/graderd/recordings"
     assert config.model_copy(update={"recording": Config().recording}) == Config()

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from graderd.api.server import MAX_PATH_BYTES
+from graderd.api.server import MAX_PATH_BYTES, tls_context
 from graderd.config import Config, ConfigError
 from graderd.drivers.backend import Parts
 from graderd.drivers.j1939.bus_health import BusEvent
@@ -25,6 +25,7 @@ from graderd.hal.vehicle import Vehicle
 from graderd.runtime.app.backends import actuator_of, check_plugins, rotator_of, stop_input_of
 from graderd.runtime.devices import Devices
 from graderd.runtime.stop_input import StopInputWatch
+from graderd.tokens import read_tokens
 
 
 def build_devices(config: Config, clock: Clock, on_bus_stop: Callable[[str], None]) -> Devices:
@@ -115,6 +116,12 @@ def problems(config: Config) -> list[str]:
     api = config.api
     if not Path(api.socket).name or len(os.fsencode(api.socket)) > MAX_PATH_BYTES:
         found.append(f"api.socket: {api.socket!r} is no path of 1 to {MAX_PATH_BYTES} bytes. Choose a shorter one")
+    if api.tcp is not None:
+        try:
+            tls_context(api.tcp)
+            read_tokens(api.tcp.token_file)
+        except DeviceError as error:
+            found.append(" ".join(str(error).split()))
     if api.socket_group:
         try:
             grp.getgrnam(api.socket_group)

@@ -1,7 +1,8 @@
-"""Write the configuration file a fresh installation starts with: every key with its meaning and its default.
+"""The configuration file a fresh installation starts with: every key with its meaning and its default.
 
-``python packaging/config_template.py FILE``. Made from the models, so it cannot fall behind them. Defaults stand as
-comments: a key somebody sets is one they meant to set, and a better default reaches everybody else with an upgrade.
+``graderd config init``, or ``python -m graderd.config.template FILE`` for the package. Made from the models, so it
+cannot fall behind them. Defaults stand as comments: a key somebody sets is one they meant to set, and a better default
+reaches everybody else with an upgrade.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import tomlkit
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from graderd.config import Config, parse
+from graderd.config.loader import parse
+from graderd.config.models import Config
 
 HEAD = """\
 # graderd's configuration. Read at start; `systemctl restart graderd` after a change (the restart begins disarmed).
