@@ -11,15 +11,17 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 from graderd.config import parse
 from graderd.core.tick import Controller, Sensed
 from graderd.hal.reading import Reading
-from graderd.record.layout import TICK, FramesWanted
+from graderd.record.files import RecordingFile
+from graderd.record.layout import TICK, FramesWanted, Memory, memory_of
 from graderd.record.reader import Recording, said
-from graderd.record.recorder import Recorder
+from graderd.record.recorder import FLUSH_S, MEMORY_EVERY_S, Item, Recorder, Step, Translator, head_of
 from harness.stretch import SETTINGS, TICK_S, stretch_of_work
 
 CAN_LINES_N, SERVO_LINES_N = 4, 6
@@ -89,6 +91,51 @@ def record_until_killed(folder: Path, after_s: float) -> float:
     ticks = list(Recording(path).messages((TICK,)))
     assert ticks, "nothing was kept"
     return max(0.0, killed_s - float(said(ticks[-1])["now_s"]))
+
+
+def record_in_virtual_time(folder: Path, seconds: float) -> Path:
+    """A run of so long, in one file, without waiting."""
+    config = parse({"recording": {"directory": str(folder), "min_free_mb": 0, "max_mb": 100_000}})
+    controller = Controller(SETTINGS)
+    path = folder / "graderd-virtual.mcap"
+    file = RecordingFile(path, head_of(config), config.model_dump_json().encode())
+    translator, due_s, flush_s = Translator(), 0.0, 0.0
+    work = itertools.cycle(stretch_of_work())
+    for number in range(round(seconds / TICK_S)):
+        sensed = _later(next(work), number * TICK_S)
+        now_s = sensed.now_s
+        items: list[Item] = [Step(sensed, controller.step(sensed), {})]
+        if now_s >= due_s:
+            due_s = now_s + MEMORY_EVERY_S
+            items.append(Memory(now_s=now_s, controller=memory_of(controller, SETTINGS)))
+        for item in items:
+            for message in translator.messages(item):
+                file.add(message)
+        if now_s >= flush_s:
+            flush_s = now_s + FLUSH_S
+            file.flush()
+    file.finish()
+    return path
+
+
+def _later(sensed: Sensed, now_s: float) -> Sensed:
+    """The same at another time, with readings as old as they were."""
+    by_s = now_s - sensed.now_s
+
+    def moved(told: Any) -> Any:
+        changes = {
+            field.name: replace(reading, time_s=reading.time_s + by_s)
+            for field in fields(told)
+            if isinstance(reading := getattr(told, field.name), Reading)
+        }
+        return replace(told, **changes)
+
+    axes = {name: replace(axis, telemetry=moved(axis.telemetry)) for name, axis in sensed.axes.items()}
+    seen = sensed.observation
+    if seen is not None:
+        seen = replace(seen, capture_s=seen.capture_s + by_s)
+    faults = tuple(replace(fault, since_s=fault.since_s + by_s) for fault in sensed.faults)
+    return replace(sensed, now_s=now_s, axes=axes, observation=seen, faults=faults)
 
 
 async def _record(folder: Path) -> None:

@@ -27,6 +27,7 @@ from graderd.record.layout import (
     TICK,
     Mark,
     Memory,
+    Message,
     controller_of,
     memory_of,
     sensed_bytes,
@@ -287,8 +288,10 @@ def _merged(differences: Iterator[Difference]) -> Iterator[Difference]:
     yield from (each for each, _ in going.values())
 
 
-def decided_again(recording: Recording) -> Iterator[tuple[str, int, bytes]]:
+def decided_again(recording: Recording) -> Iterator[Message]:
     """The recording's messages with what today is seen and decided in place of what was: a new reference.
+
+    Where the tick's memory is another version's, the first tick is kept as it was, and its state begun with.
 
     Raises:
         ProtocolError: as :func:`check`.
@@ -296,20 +299,30 @@ def decided_again(recording: Recording) -> Iterator[tuple[str, int, bytes]]:
     settings = tick_settings(recording.config)
     pictures, _ = _pictures(recording, recording.config, Check())
     controller: Controller | None = None
-    sensed = None
+    sensed: Sensed | None = None
+    cold = False
+
+    def memory(now_s: float, of: Controller) -> bytes:
+        return Memory(now_s=now_s, controller=memory_of(of, settings)).model_dump_json().encode()
+
     for message in recording.messages():
-        data = message.data
         if message.topic == SENSED:
-            sensed = _seen_today(sensed_of(data), pictures, recording.config)
-            data = sensed_bytes(sensed)
+            sensed = _seen_today(sensed_of(message.data), pictures, recording.config)
+            yield message._replace(data=sensed_bytes(sensed))
         elif message.topic == MEMORY:
-            memory = Memory.model_validate_json(data)
+            told = Memory.model_validate_json(message.data)
             if controller is None:
                 try:
-                    controller = controller_of(memory.controller, settings)
+                    controller = controller_of(told.controller, settings)
                 except ValueError:
-                    controller = Controller(settings)
-            data = Memory(now_s=memory.now_s, controller=memory_of(controller, settings)).model_dump_json().encode()
-        elif message.topic == TICK and controller is not None and sensed is not None:
-            data = tick_bytes(controller.step(sensed))
-        yield message.topic, message.log_ns, data
+                    cold = True
+                    continue
+            yield message._replace(data=memory(told.now_s, controller))
+        elif message.topic == TICK and sensed is not None and controller is not None:
+            yield message._replace(data=tick_bytes(controller.step(sensed)))
+        elif message.topic == TICK and sensed is not None and cold:
+            yield message
+            controller = Controller(settings, _state(message.data))
+            yield message._replace(topic=MEMORY, data=memory(sensed.now_s, controller))
+        else:
+            yield message

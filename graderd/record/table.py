@@ -25,9 +25,11 @@ AXIS_COLUMNS: Final = tuple(
         "because",
     )
 )
+THIRDS: Final = ("left", "center", "right")
 COLUMNS: Final = (
-    "wall_time", "now_s", "mode", "reason", "zone", "confidence", "left_l", "center_l", "right_l", "decision",
-    "decision_deg", "speed_m_per_s", "travelled_m", "torque_nm", "temperature_c", *AXIS_COLUMNS, "faults", "commands",
+    "wall_time", "now_s", "mode", "reason", "zone", "confidence", "left_l", "center_l", "right_l",
+    "ahead_zone", "ahead_confidence", "ahead_left_l", "ahead_center_l", "ahead_right_l", "decision", "decision_deg",
+    "speed_m_per_s", "travelled_m", "torque_nm", "temperature_c", *AXIS_COLUMNS, "faults", "commands",
 )  # fmt: skip
 
 
@@ -57,6 +59,9 @@ def _row(log_ns: int, sensed: dict[str, Any], tick: dict[str, Any]) -> Row:
         "left_l": soil.get("volume_left_l"),
         "center_l": soil.get("volume_center_l"),
         "right_l": soil.get("volume_right_l"),
+        "ahead_zone": soil.get("ahead", {}).get("zone"),
+        "ahead_confidence": soil.get("ahead", {}).get("confidence"),
+        **{f"ahead_{third}_l": soil.get("ahead", {}).get("litres", {}).get(third) for third in THIRDS},
         "decision": decision.get("zone"),
         "decision_deg": decision.get("angle_deg"),
         "speed_m_per_s": _value(vehicle, "speed_m_per_s"),

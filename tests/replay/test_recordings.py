@@ -17,9 +17,10 @@ from graderd.perception.classifier import judge_frame, make_classifier
 from graderd.record.export import raw_frames
 from graderd.record.files import RecordingFile
 from graderd.record.frames import messages_of
-from graderd.record.layout import FRAMES_SUFFIX, Message
+from graderd.record.layout import FRAMES_SUFFIX
 from graderd.record.reader import Recording
 from graderd.record.replay import check, decided_again
+from graderd.record.table import rows
 
 FOLDER = Path(__file__).parent / "recordings"
 RECORDINGS = sorted(path for path in FOLDER.glob("*.mcap") if not path.name.endswith(FRAMES_SUFFIX))
@@ -30,6 +31,8 @@ def test_today_decides_what_was_decided(path: Path) -> None:
     found = check(Recording(path))
     assert [difference.text for difference in found.differences] == []
     assert found.frames_n >= 1
+    decided = [row.get("decision") for row in rows(Recording(path))]
+    assert {"left", "right"} <= set(decided), "it is still the work that it is meant to be"
     # Where the tick's memory has another shape by now, its first ten seconds are not judged until it is written anew.
     assert found.ticks_n > (200 if found.warm_ups_n else 700)
 
@@ -39,8 +42,8 @@ def update(path: Path) -> None:
     recording = Recording(path)
     new = path.with_suffix(".new")
     file = RecordingFile(new, recording.head, recording.config_json)
-    for topic, log_ns, data in decided_again(recording):
-        file.add(Message(topic, log_ns, data))
+    for message in decided_again(recording):
+        file.add(message)
     file.finish()
     new.replace(path)
     config = recording.config

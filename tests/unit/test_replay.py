@@ -18,7 +18,7 @@ from graderd.core.soil import Zone
 from graderd.core.tick import Controller, Sensed
 from graderd.record import recorder as recorder_module
 from graderd.record.files import RecordingFile
-from graderd.record.layout import FRAME, MEMORY, TICK, Memory, Message, frame_bytes, frame_of
+from graderd.record.layout import FRAME, MEMORY, TICK, Memory, Message, frame_bytes, frame_of, tick_of
 from graderd.record.reader import Recording
 from graderd.record.recorder import Recorder
 from graderd.record.replay import check, decided_again
@@ -150,7 +150,7 @@ def test_a_frame_that_is_seen_otherwise_is_listed_and_reaches_the_tick(path: Pat
         lambda data: frame_bytes(
             replace(
                 frame_of(data),
-                observation=replace(frame_of(data).observation, zone=Zone.RIGHT, ahead=None),
+                observation=replace(frame_of(data).observation, zone=Zone.CENTER, ahead=None),
             )
         ),
     )
@@ -158,7 +158,7 @@ def test_a_frame_that_is_seen_otherwise_is_listed_and_reaches_the_tick(path: Pat
     lied.path.replace(tmp_path / frames.name)
     found = check(Recording(copy))
     (picture,) = (d for d in found.differences if d.kind == "picture")
-    assert "right" in picture.recorded
+    assert "center" in picture.recorded
     assert picture.size >= 1.0
 
 
@@ -170,7 +170,14 @@ def _copied(path: Path, folder: Path) -> Path:
 
 def test_a_new_reference_is_what_today_decides(tmp_path: Path) -> None:
     recording = recorded(tmp_path)
-    assert [Message(*each) for each in decided_again(recording)] == list(recording.messages())
+    assert list(decided_again(recording)) == list(recording.messages())
+
+
+def test_a_new_reference_of_another_version_is_the_same_work(tmp_path: Path) -> None:
+    recording = recorded(tmp_path)
+    foreign = changed(recording, MEMORY, lambda _: Memory(now_s=100.0, controller=b"?").model_dump_json().encode())
+    again = [tick_of(message.data).state.mode for message in decided_again(foreign) if message.topic == TICK]
+    assert again == [tick_of(message.data).state.mode for message in recording.messages((TICK,))]
 
 
 def test_the_command_ends_with_what_it_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
