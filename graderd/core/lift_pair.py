@@ -53,7 +53,7 @@ class LiftPairSettings(Settings):
         description="a commanded side that does not move for so long is stuck; starting takes 0.4 s",
     )
     silent_s: Positive = Field(
-        0.14,
+        0.135,
         ge=0.12,
         le=0.6,
         description="a position older than this holds both until there is a newer one; 0.105 s are a feedback period",
@@ -432,11 +432,19 @@ class LiftPair:
             ),
             default=settings.full_speed_mm_per_s,
         )
-        for side, deviation_mm in zip(self._sides, deviations_mm, strict=True):
-            ahead_mm = 2.0 * deviation_mm * side.way_sign
-            own_mm_per_s = pace_mm_per_s * (abs(side.way_mm) / longest_mm if longest_mm else 1.0)
-            wanted_mm_per_s = min(own_mm_per_s - settings.catch_up_hz * ahead_mm, self._max_speed_mm_per_s)
-            share = wanted_mm_per_s / side.gain_mm_per_s
+        own_mm_per_s = [pace_mm_per_s * (abs(s.way_mm) / longest_mm if longest_mm else 1.0) for s in self._sides]
+        ahead_mm = [2.0 * d * s.way_sign for s, d in zip(self._sides, deviations_mm, strict=True)]
+        ahead = 0 if ahead_mm[0] > ahead_mm[1] else 1
+        behind = 1 - ahead
+        # The side behind makes up for it as far as it can go faster, and the side ahead waits for the rest.
+        wanted_mm_per_s = settings.catch_up_hz * max(0.0, -ahead_mm[behind])
+        fastest_mm_per_s = min(most_share * self._sides[behind].gain_mm_per_s, self._max_speed_mm_per_s)
+        more_mm_per_s = min(wanted_mm_per_s, max(0.0, fastest_mm_per_s - own_mm_per_s[behind]))
+        left = 1.0 - more_mm_per_s / wanted_mm_per_s if wanted_mm_per_s else 1.0
+        own_mm_per_s[behind] += more_mm_per_s
+        own_mm_per_s[ahead] -= left * settings.catch_up_hz * max(0.0, ahead_mm[ahead])
+        for side, speed_mm_per_s in zip(self._sides, own_mm_per_s, strict=True):
+            share = speed_mm_per_s / side.gain_mm_per_s
             # One that may be as fast as it slows down to by itself is left to that: it starts sooner when told more.
             side.share = 1.0 if near and share > most_share - _SHARE_STEP else min(max(share, settings.min_share), 1.0)
         return self._commands()

@@ -124,6 +124,26 @@ def test_a_side_that_does_not_move_stops_the_other() -> None:
     assert left_mm - 100.0 < 4.0, "the side that moved was held before it got away"
 
 
+def test_a_side_that_sticks_holds_the_other_with_the_next_reading() -> None:
+    """Both run at 33 mm/s; then one stands. Half of the way to the next reading is enough to know."""
+    for stands_ms in (0, 20, 40):
+        pair, at_mm, held_s = LiftPair(), [100.0, 100.0], 0.0
+        left, right = reading(100.0, 0.0), reading(100.0, 0.0)
+        for ms in range(0, 2000, 20):
+            now_s = ms / 1000.0
+            if ms % 100 == 0:
+                left, right = reading(at_mm[0], now_s), reading(at_mm[1], now_s)
+            command = pair.step(now_s, left, right, 250.0, 250.0)
+            if command.left.target_mm is None:
+                held_s = now_s
+                break
+            at_mm[0] += 0.66 if ms >= 200 else 0.0
+            at_mm[1] += 0.66 if 200 <= ms < 1000 + stands_ms else 0.0
+        assert command.right.target_mm is not None, "it is let come up"
+        assert held_s == pytest.approx(1.1), stands_ms
+        assert not command.stopped
+
+
 def test_sides_far_apart_are_reported_and_then_stopped() -> None:
     pair = LiftPair()
     pair.step(0.0, reading(100, 0), reading(100, 0), 200.0, 200.0)
