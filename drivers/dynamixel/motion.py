@@ -15,7 +15,7 @@ _STAMP_S = 0.02
 _HULL_S = 0.1
 """Between readings further apart the speed may have been anything: the older one vouches for nothing."""
 _STILL_DEG_PER_S = 0.6
-STANDS_DEG, PUSHES_DEG = 3.0, 2.0
+STANDS_DEG, PUSHES_DEG = 2.0, 1.5
 """Of the blade: a set point so far ahead of one that stands is led back to so little: enough to push and to be told as
 not moving, too little to leap when it comes free. One that is followed runs ahead too, but of a blade in motion."""
 
