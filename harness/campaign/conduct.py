@@ -319,8 +319,7 @@ async def recover(stack: Stack, case: Case, outcome: Outcome, before: str) -> No
             await stack.command("disarm")
             way.append("disarm")
         if mode in ("stopped", "disarmed") or way:
-            await _retry(stack, "arm", case.recover_s)
-            await stack.until_status(lambda s: s["mode"] == "manual", 6.0, "not armed again")
+            await _arm(stack, case.recover_s)
             way.append("arm")
         if before == "auto" and row.reaction is Reaction.RETREAT:
             await _retry(stack, "auto", 2.0)
@@ -342,6 +341,22 @@ async def _retry(stack: Stack, command: str, timeout_s: float) -> None:
             return
         await asyncio.sleep(0.1)
     raise CampaignError(f"{command} stays refused: {answer.get('message') or answer.get('error')}")
+
+
+async def _arm(stack: Stack, timeout_s: float) -> None:
+    """Arm, and see it armed. A device that is only just back may take the request and then refuse: whoever stands there
+    arms again, and so does this."""
+    end_s = time.monotonic() + timeout_s
+    said = ""
+    while time.monotonic() < end_s:
+        status = await stack.read_status() or {}
+        if status.get("mode") == "manual":
+            return
+        if status.get("mode") == "disarmed" and not status["arming"]:
+            answer = await stack.command("arm")
+            said = answer.get("message") or answer.get("error") or ""
+        await asyncio.sleep(0.1)
+    raise CampaignError(f"not armed again within {timeout_s:g} s: {stack.status.get('reason')}; {said}")
 
 
 def _named(status: JsonObject, faults: tuple[str, ...]) -> list[str]:
