@@ -1,4 +1,5 @@
-"""Depth as files: ``.npy`` and 16-bit PNG with a camera file beside them, point clouds as ``.ply`` and ``.las``."""
+"""Depth as files: ``.npy`` and 16-bit PNG with a camera file beside them, recordings with raw frames (``.mcap``), point
+clouds as ``.ply`` and ``.las``."""
 
 from __future__ import annotations
 
@@ -16,10 +17,13 @@ from graderd.evaluation.ground import F64
 from graderd.hal.camera import Intrinsics, StreamPose
 from graderd.hal.errors import DeviceMissingError, ProtocolError
 from graderd.perception.geometry import View
+from graderd.record.export import raw_frames
+from graderd.record.reader import Recording
 
 CAMERA = "camera.json"
 PICTURES = (".npy", ".png")
 CLOUDS = (".ply", ".las")
+RECORDING = ".mcap"
 EXTRA = "Install graderd[evaluation]"
 
 Edge = Literal["up", "down", "left", "right"]
@@ -75,6 +79,27 @@ def find(folder: Path, pattern: str, where: str) -> list[Path]:
     )
 
 
+Span = tuple[float, float]
+"""Seconds after a recording's first raw frame: from, to."""
+
+
+def span_of(name: str, where: str) -> tuple[str, Span | None]:
+    """A name, and the part of a recording that ``NAME@FROM..TO`` stands for; None: all of it.
+
+    Raises:
+        ProtocolError: what follows the @ is no span.
+    """
+    pattern, at, text = name.rpartition("@")
+    if not at or not pattern.endswith(RECORDING):
+        return name, None
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\.\.(\d+(?:\.\d+)?)", text)
+    if match is None or float(match[1]) >= float(match[2]):
+        raise ProtocolError(
+            where, f"{text!r} is no part of a recording", "Seconds after its first picture: name.mcap@3..4.5"
+        )
+    return pattern, (float(match[1]), float(match[2]))
+
+
 class Reader:
     """Reads scans; lens and rays are read once for each camera file."""
 
@@ -83,9 +108,11 @@ class Reader:
         self._picture = (np.array((0.0, 0.0, -1.0)), np.array(_OF_EDGE[travel]))
         self._cloud = (_axis(cloud_up), _axis(cloud_travel))
         self._lenses: dict[Path, tuple[Lens, F64]] = {}
+        self._recorded_rays: dict[Lens, F64] = {}
 
-    def scans(self, path: Path) -> list[Points]:
-        """The scans in one file: one, or as many as a three-dimensional ``.npy`` holds.
+    def scans(self, path: Path, span: Span | None = None) -> list[Points]:
+        """The scans in one file: one, or as many as a three-dimensional ``.npy`` or a recording holds; ``span``: of a
+        recording.
 
         Raises:
             DeviceMissingError, ProtocolError: it cannot be read; the message says why.
@@ -97,10 +124,34 @@ class Reader:
             if not known.any():
                 raise ProtocolError(str(path), "holds no points")
             return [Points(points_m[known] * 1000.0, *self._cloud)]
+        if suffix == RECORDING:
+            return self._recorded(path, span)
         if suffix not in PICTURES:
-            raise ProtocolError(str(path), f"{suffix or 'no suffix'} is none of {', '.join((*PICTURES, *CLOUDS))}")
+            readable = ", ".join((*PICTURES, RECORDING, *CLOUDS))
+            raise ProtocolError(str(path), f"{suffix or 'no suffix'} is none of {readable}")
         lens, rays = self._lens(self._camera or path.parent / CAMERA, path)
         return [self._back_projected(path, depth, lens, rays) for depth in _pictures(path)]
+
+    def _recorded(self, path: Path, span: Span | None) -> list[Points]:
+        """The depth pictures among a recording's raw frames, by the lens that each came with."""
+        found: list[Points] = []
+        first_s: float | None = None
+        for judged in raw_frames(Recording(path)):
+            frame = judged.frame
+            first_s = frame.capture_s if first_s is None else first_s
+            if span is not None and not span[0] <= frame.capture_s - first_s <= span[1]:
+                continue
+            if frame.depth_mm is None or frame.depth_intrinsics is None:
+                continue
+            told = frame.depth_intrinsics
+            lens = Lens(**{name: getattr(told, name) for name in Lens.model_fields if hasattr(told, name)})
+            if lens not in self._recorded_rays:
+                self._recorded_rays[lens] = lens.rays()
+            found.append(self._back_projected(path, frame.depth_mm, lens, self._recorded_rays[lens]))
+        if not found:
+            which = "" if span is None else f" from {span[0]:g} to {span[1]:g} s"
+            raise ProtocolError(str(path), f"holds no raw depth{which}", "Record with graderd record start --raw full")
+        return found
 
     def _back_projected(self, path: Path, depth: Any, lens: Lens, rays: F64) -> Points:
         if depth.shape != (lens.height, lens.width):

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from graderd.evaluation.bed import Bed, Grid, Points, bed_of, common_grid
-from graderd.evaluation.depth_files import Reader, find
+from graderd.evaluation.depth_files import Reader, find, span_of
 from graderd.evaluation.experiment import Case, Experiment, Trial
 from graderd.evaluation.ground import F64, NoGroundError
 from graderd.evaluation.measures import (
@@ -68,7 +68,12 @@ def evaluate_trials(
 
 
 def _scans(reader: Reader, folder: Path, names: Iterable[str], where: str) -> list[Points]:
-    return [scan for name in names for path in find(folder, name, where) for scan in reader.scans(path)]
+    found: list[Points] = []
+    for name in names:
+        pattern, span = span_of(name, where)
+        for path in find(folder, pattern, where):
+            found += reader.scans(path, span)
+    return found
 
 
 class _Work:

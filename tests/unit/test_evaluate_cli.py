@@ -16,7 +16,13 @@ import plyfile
 import pytest
 
 from graderd.cli.app import run_app
+from graderd.config import Config
+from graderd.core.attitude import UNMEASURED
+from graderd.core.soil import SoilObservation, Zone
 from graderd.evaluation.ground import F64
+from graderd.hal.camera import Frame
+from graderd.record.files import RecordingFile
+from graderd.record.frames import Judged, messages_of
 from harness.top_view import HALF_VIEW, TopCamera, heap, save, trapezoid
 
 pytestmark = pytest.mark.xdist_group("evaluate cli")  # one set of scans for all
@@ -258,7 +264,7 @@ def test_a_bad_experiment_file_is_told_with_its_place(
     [
         ("nothing-*.png", "heap, trial[1]: no file is named 'nothing-*.png'"),
         ("../../**/", "no file is named"),
-        ("notes.txt", "notes.txt: .txt is none of .npy, .png, .ply, .las"),
+        ("notes.txt", "notes.txt: .txt is none of .npy, .png, .mcap, .ply, .las"),
         ("eight.png", "eight.png: not a 16-bit grey PNG"),
         ("small.npy", "small.npy: is 8x5, its camera file says 848x240"),
         ("blind.npy", "blind.npy: no pixel has depth"),
@@ -336,3 +342,52 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(__import__("sys").modules, "scipy.stats", None)
     assert run_app(["evaluate", "--study"]) == 2
     assert "Install graderd[evaluation]" in capsys.readouterr().err
+
+
+def test_a_recording_holds_the_bed_before_and_after_and_gives_what_pictures_give(
+    folder: Path, tmp_path: Path, capsys: Captured
+) -> None:
+    """Three pictures a second of the bed before, and from the fourth second on after the pass."""
+    file = RecordingFile(tmp_path / "pass.mcap", {"version": "t"}, Config().model_dump_json().encode())
+    states = [camera(0).scans_mm(heap(trapezoid(0.0, 200.0, 600.0, 120.0), -200.0, 200.0, 60.0), 3)]
+    states.append(camera(1).scans_mm(layer(46.0), 3))
+    for state, scans in enumerate(states):
+        for number, depth in enumerate(scans):
+            at_s = 100.0 + 4.0 * state + number / 3.0
+            frame = Frame(np.zeros((2, 2, 3), np.uint8), depth, None, HALF_VIEW, at_s)
+            seen = SoilObservation(at_s, Zone.UNKNOWN, 0.0, "")
+            for message in messages_of(Judged(frame, 0.0, 0.0, UNMEASURED, at_s, seen), 1, 0):
+                file.add(message)
+    file.finish()
+    lines = """name = "pass"
+[[case]]
+name = "Flattening work"
+work = "flattening"
+target_height_mm = 50.0
+[[case.trial]]
+angle_deg = 15
+before = ["pass.mcap@0..2"]
+after = ["pass.mcap@4..9.5"]
+"""
+    (tmp_path / "pass.toml").write_text(lines)
+    found = evaluated(tmp_path / "pass.toml", capsys)
+    pictures = lines.replace("pass.mcap@0..2", "flat-15-1-before-*.png").replace(
+        "pass.mcap@4..9.5", "flat-15-1-after-*.png"
+    )
+    (folder / "pictures.toml").write_text(pictures)
+    assert evaluated(folder / "pictures.toml", capsys) == found
+    assert found["Flattening work", 15.0, "volume_moved_l"]["value"] > 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("pass.mcap@4..2", "'4..2' is no part of a recording"),
+        ("pass.mcap@now", "'now' is no part of a recording"),
+        ("pass.mcap@50..60", "no recording of graderd's"),
+    ],
+)
+def test_a_wrong_part_of_a_recording_is_told_in_a_line(tmp_path: Path, capsys: Captured, name: str, words: str) -> None:
+    (tmp_path / "pass.mcap").write_bytes(b"nothing")
+    assert run_app(["evaluate", str(one_trial(tmp_path, "x", f'after = ["{name}"]'))]) == 2
+    assert words in capsys.readouterr().err
