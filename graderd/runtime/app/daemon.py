@@ -228,6 +228,7 @@ class Daemon:
 
     def _on_signal(self, number: int) -> None:
         name = signal.Signals(number).name
+        log.info("ending: %s received", name)
         self._notifier.stopping()
         if not self._loop.end(f"{name} received"):
             self._recorder.expect_stop()
