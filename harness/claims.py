@@ -1,8 +1,8 @@
 """``python -m harness.claims``: what docs/integrators/safety.md claims, taken out one by one, and which tests notice.
 
 Each takes one function's effect out of a copy of the tree, and runs the tests that the page names for it. The name
-begins with the page's function. How it is done, and what the exit status says: ``harness/seeded.py``. The page's last
-results stand in docs/developers/mutation.md.
+begins with the page's function, or with what happened once (I1 to I17). How it is done, and what the exit status says:
+``harness/seeded.py``. The last results stand in docs/developers/mutation.md.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ from harness.seeded import Mutant, command_line
 
 CONTROL: Final = "tests/unit/test_runtime_control.py::"
 GATE: Final = "tests/unit/test_core_gate.py::"
+MACHINE: Final = "tests/unit/test_core_machine.py::"
+TICK: Final = "tests/unit/test_core_tick.py::"
+PARTS: Final = "tests/unit/test_runtime_parts.py::"
 MODEL: Final = "tests/unit/test_core_machine_model.py::"
 STOP: Final = "tests/unit/test_api_stop.py::"
 SOCKETS: Final = "tests/unit/test_api_sockets.py::"
@@ -351,6 +354,22 @@ CLAIMS: Final = (
         "each side goes as fast as it can",
     ),
     Mutant(
+        "F14-sticks",
+        "graderd/core/lift_pair.py",
+        "        elif self._waiting is None and any(side.sticks for side in self._sides):\n",
+        "        elif False:\n",
+        ("tests/unit/test_attitude.py::test_a_side_that_sticks_holds_the_other_with_the_next_reading",),
+        "a lift goes on beside one that sticks until it is far ahead",
+    ),
+    Mutant(
+        "F14-at-once",
+        "drivers/electrak/actuator.py",
+        "        if urgent and now_s - self._control_at_s >= _APART_S:\n",
+        "        if False:\n",
+        ("tests/fault/test_electrak_faults.py::test_a_start_and_a_slower_speed_leave_at_once_and_what_can_wait_does",),
+        "a lift hears up to 100 ms later that it is to go slower",
+    ),
+    Mutant(
         "F15-last-address",
         "drivers/j1939/link.py",
         "        return user.stop_frame(self._last_address, now_s)\n",
@@ -389,6 +408,203 @@ CLAIMS: Final = (
         "    dt_s = inputs.dt_s\n",
         (GATE + "test_a_late_tick_is_not_made_up_for",),
         "a late tick is made up for by a leap",
+    ),
+    Mutant(
+        "I2-accepted",
+        "graderd/core/tick.py",
+        "        if event is not None and state.mode is before.mode and state.arming_since_s is None:\n",
+        "        if False:\n",
+        (TICK + "test_a_latch_is_let_go_only_by_what_the_machine_accepts",),
+        "what was latched is let go although the machine refused",
+    ),
+    Mutant(
+        "I3-on-what-was-asked",
+        "graderd/core/tick.py",
+        "position is not None and abs(position - requested) <= tolerance,\n",
+        "position is not None and passed.limited is None,\n",
+        (TICK + "test_a_held_axis_has_not_arrived",),
+        "an axis that is held counts as arrived",
+    ),
+    Mutant(
+        "I3-held-ends",
+        "graderd/core/machine.py",
+        "            if goal is not None and axis in held:\n",
+        "            if False:\n",
+        (MACHINE + "test_what_was_held_does_not_go_on_by_itself",),
+        "a preset goes on when the hold is over",
+    ),
+    Mutant(
+        "I3-short-ends",
+        "graderd/core/machine.py",
+        "        if state.later and inputs.settled and not inputs.arrived:\n",
+        "        if False:\n",
+        (MACHINE + "test_a_preset_that_stands_short_of_a_stage_ends",),
+        "a preset goes on to its next stage from a bound short of the first",
+    ),
+    Mutant(
+        "I4-queue-void",
+        "graderd/runtime/control.py",
+        "        while self._queue:\n",
+        "        while False:\n",
+        (CONTROL + "test_what_was_asked_before_a_stop_is_void",),
+        "a reset sent before a stop undoes it",
+    ),
+    Mutant(
+        "I4-reset-names-its-stop",
+        "graderd/core/machine.py",
+        "            if command.stop_n != state.stop_n:\n",
+        "            if False:\n",
+        (MACHINE + "test_a_reset_clears_the_stop_it_names_and_none_that_came_after",),
+        "a reset of one stop clears a later one",
+    ),
+    Mutant(
+        "I4-each-reason",
+        "graderd/core/machine.py",
+        "    others = tuple(why for why in state.stops[:1] if why != reason)\n",
+        "    others = ()\n",
+        (MACHINE + "test_a_second_stops_reason_is_kept_beside_the_firsts_and_each_is_counted",),
+        "a second stop hides why the first was",
+    ),
+    Mutant(
+        "I4-sent-once",
+        "graderd/client.py",
+        '    return dropped and (method == "GET" or path == STOP_PATH)\n',
+        "    return dropped\n",
+        ("tests/unit/test_client.py::test_what_may_move_is_never_sent_twice",),
+        "a client repeats a reset or a jog whose answer was lost",
+    ),
+    Mutant(
+        "I7-by-sigint",
+        "graderd/cli/__init__.py",
+        "        os.kill(os.getpid(), signal.SIGINT)\n        raise  # not reached\n",
+        "        status = 0\n",
+        ("tests/unit/test_cli_jog.py::test_ctrl_c_ends_what_the_shell_would_do_next",),
+        "after Ctrl-C a shell goes on to the next motion",
+    ),
+    Mutant(
+        "I8-overspeed",
+        "graderd/core/plausibility.py",
+        "        if self._gained <= self._figures.overspeed_margin:\n",
+        "        if self._gained or True:\n",
+        (PLAUSIBLE + "test_a_snap_is_overspeed",),
+        "a blade that snaps is not told",
+    ),
+    Mutant(
+        "I11-lapse-first",
+        "graderd/core/machine.py",
+        "    state = _lapse(_react(state, inputs), inputs.now_s)\n",
+        "    state = _react(state, inputs)\n",
+        (MACHINE + "test_a_late_renewal_renews_nothing",),
+        "a lease that lapsed is renewed by a late message",
+    ),
+    Mutant(
+        "I12-blind-detectors",
+        "graderd/config/models.py",
+        "            if value_s < periods_n * period_s - 1e-9:\n",
+        "            if False:\n",
+        (
+            "tests/unit/test_config_bounds.py::test_a_configuration_under_which_a_detector_is_blind_is_refused_in_one_line",
+        ),
+        "a tick too slow for a detector is taken",
+    ),
+    Mutant(
+        "I13-log-waits-for-nobody",
+        "graderd/runtime/app/journal.py",
+        "            self._records.put_nowait(record)\n        except queue.Full:\n",
+        "            self._records.put(record)\n        except queue.Full:\n",
+        (
+            "tests/unit/test_runtime_journal.py::test_a_pipe_that_nobody_reads_is_not_waited_for_and_what_was_lost_is_told",
+        ),
+        "who logs waits for a pipe that nobody reads",
+    ),
+    Mutant(
+        "I13-wires-first",
+        "graderd/runtime/control.py",
+        "        self.tick = self.controller.step(self.sensed)\n        self._act(self.tick)",
+        "        self.tick = self.controller.step(self.sensed)\n        self._note(before.mode, self.tick.state)\n"
+        "        self._act(self.tick)",
+        (CONTROL + "test_the_wires_come_before_the_log_and_the_state_file",),
+        "the wires wait for log and state file",
+    ),
+    Mutant(
+        "I14-stop-socket",
+        "graderd/api/server.py",
+        "        await stack.enter_async_context(serving_stops(stop_listener, stops))\n        if tcp",
+        "        if tcp",
+        (STOP + "test_a_stop_on_the_stop_socket_waits_for_nothing_and_counts_when_its_sender_is_gone",),
+        "a stop waits in the queue of everybody",
+    ),
+    Mutant(
+        "I14-client-takes-it",
+        "graderd/client.py",
+        "        if stop_lane and _is_socket(stop_socket):\n",
+        "        if False:\n",
+        (STOP + "test_the_client_takes_the_stop_socket",),
+        "the command line's stop waits in the queue of everybody",
+    ),
+    Mutant(
+        "I15-helpers",
+        "graderd/runtime/app/daemon.py",
+        'started again: %s", name, error)\n            await asyncio.sleep(RESTART_S)\n',
+        'started again: %s", name, error)\n            raise\n',
+        (DAEMON + "test_a_camera_child_that_cannot_be_started_for_want_of_files_is_tried_again",),
+        "a camera child that cannot be started ends control",
+    ),
+    Mutant(
+        "I15-hold-first",
+        "graderd/runtime/app/daemon.py",
+        "            self._devices.hold_all()\n            raise\n",
+        "            raise\n",
+        (DAEMON + "test_a_control_loop_that_fails_holds_every_axis_first",),
+        "a control loop that fails leaves the axes on their way",
+    ),
+    Mutant(
+        "I15-hang-up",
+        "graderd/runtime/app/daemon.py",
+        "ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)",
+        "ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM)",
+        (DAEMON + "test_a_terminal_that_hangs_up_ends_the_daemon_in_order",),
+        "a terminal that hangs up kills the daemon in mid-turn",
+    ),
+    Mutant(
+        "I15-socket-file",
+        "graderd/api/server.py",
+        "        if ours is not None and _identity(path) == ours:\n            continue\n",
+        "        if ours is not None or _identity(path) == ours:\n            continue\n",
+        (STOP + "test_a_socket_file_that_is_taken_away_is_made_again",),
+        "a deleted socket file leaves nobody who takes a stop",
+    ),
+    Mutant(
+        "I16-own-standstill",
+        "graderd/core/machine.py",
+        'if f.present and f.name == STANDSTILL), "")',
+        'if False), "")',
+        (CONTROL + "test_after_a_freeze_the_reason_is_the_freeze",),
+        "after a freeze a person is sent to a device that is well",
+    ),
+    Mutant(
+        "I16-flapping",
+        "graderd/core/faults/monitor.py",
+        "        return Seen(self.first_s, there_s) if self.now or there_s > 0.0 else None\n",
+        "        return Seen(self.first_s, there_s) if self.now else None\n",
+        ("tests/unit/test_fault_catalogue.py::test_a_fault_that_flaps_faster_than_its_debounce_is_told",),
+        "a fault that flaps faster than its debounce is never told",
+    ),
+    Mutant(
+        "I17-old-soil",
+        "graderd/core/soil.py",
+        "        if age_s <= max_age_s:\n",
+        "        if age_s or max_age_s:\n",
+        (PARTS + "test_what_is_past_its_age_is_told_as_unknown",),
+        "old soil is told as sure",
+    ),
+    Mutant(
+        "I17-validity",
+        "graderd/runtime/status.py",
+        "        if reading is not None and reading.is_fresh(now_s, valid_for_s):\n",
+        "        if reading is not None:\n",
+        (PARTS + "test_what_is_past_its_age_is_told_as_unknown",),
+        "old readings are told as if they were new",
     ),
 )
 

@@ -12,7 +12,8 @@ from harness.seeded import Mutant, misfit
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/integrators/safety.md").read_text(encoding="utf-8")
-ROWS = dict(re.findall(r"^\| (F\d+) \|(.*)$", PAGE.split("## Functions, reaction times and proof")[1], re.MULTILINE))
+ROWS = dict(re.findall(r"^\| ([FI]\d+) \|(.*)$", PAGE.split("## Functions, reaction times and proof")[1], re.MULTILINE))
+BY_NAME = {claim.name: claim for claim in CLAIMS}
 
 
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.name)
@@ -26,8 +27,19 @@ def test_each_can_be_taken_out_and_its_tests_are_named(claim: Mutant) -> None:
 
 
 def test_no_function_is_left_out() -> None:
-    assert {claim.name.partition("-")[0] for claim in CLAIMS} == ROWS.keys()
-    assert len({claim.name for claim in CLAIMS}) == len(CLAIMS)
+    functions = {name for name in ROWS if name.startswith("F")}
+    assert {claim.name.partition("-")[0] for claim in CLAIMS if claim.name.startswith("F")} == functions
+    assert len(BY_NAME) == len(CLAIMS)
+
+
+@pytest.mark.parametrize("number", range(1, 18))
+def test_what_happened_once_is_noticed_by_tests_that_were_seen_to_notice(number: int) -> None:
+    told = re.findall(r"`(tests/[^`]+)` \(([FI]\d+-[a-z-]+)\)", ROWS[f"I{number}"])
+    assert told
+    for test, name in told:
+        assert test in BY_NAME[name].tests
+    own = {claim.name for claim in CLAIMS if claim.name.startswith(f"I{number}-")}
+    assert own <= {name for _, name in told}
 
 
 def test_the_page_of_results_tells_of_every_one() -> None:
