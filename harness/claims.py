@@ -272,8 +272,8 @@ CLAIMS: Final = (
     Mutant(
         "F10-dwell",
         "graderd/core/rule.py",
-        "    if now_s - decision.decided_s < rule.dwell_s or not decision.votes:\n",
-        "    if not decision.votes:\n",
+        "    if winner is None or now_s - decision.decided_s < rule.dwell_s:\n",
+        "    if winner is None:\n",
         ("tests/unit/test_core_rule.py::test_dwell_separates_decisions",),
         "decisions follow each other without a pause",
     ),

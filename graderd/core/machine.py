@@ -17,7 +17,7 @@ from pydantic import Field
 from graderd.core import commands as cmd
 from graderd.core.axes import PARTS, Goals, Pose
 from graderd.core.faults.monitor import ActiveFault, Reaction, held_axes, worst
-from graderd.core.rule import Decision, RuleSettings, Travel, decide
+from graderd.core.rule import Decision, RuleSettings, Travel, decide, interrupted
 from graderd.core.soil import SoilObservation
 from graderd.hal.settings import Positive, Settings
 
@@ -327,9 +327,9 @@ def _advance(state: State, inputs: Inputs, settings: MachineSettings, rule: Rule
         elif state.later and inputs.settled:
             state = replace(state, goals=state.later[0], later=state.later[1:])
     if state.mode is Mode.AUTO:
-        # A hold ends the decision, and the votes for the next: what moves afterwards was decided afterwards.
+        # A hold takes the angle, and the votes for the next: what moves afterwards was decided afterwards.
         decision = (
-            Decision()
+            interrupted(state.decision, inputs.now_s, rule, inputs.travel)
             if "rotation" in held
             else decide(state.decision, inputs.observation, inputs.settled, inputs.now_s, rule, inputs.travel)
         )
@@ -360,8 +360,10 @@ def _why_holding(state: State, inputs: Inputs) -> tuple[str, ...]:
         for f in _counting(state, inputs)
         if f.row.reaction >= Reaction.HOLD
     ]
-    if state.mode is Mode.AUTO and state.decision.zone is None and not reasons:
-        reasons.append("no decision yet: the camera has not shown soil clearly enough")
+    if state.mode is Mode.AUTO and state.decision.angle_deg is None and not reasons:
+        zone = state.decision.zone
+        no_decision = "no decision yet: the camera has not shown soil clearly enough"
+        reasons.append(no_decision if zone is None else f"held in mid-pass: {zone} not seen again")
     return tuple(reasons)
 
 

@@ -83,7 +83,10 @@ class Decision:
 
     ``ended``: why the pass it was taken for is over; empty while it is kept. One that is not kept holds its angle until
     the next one. ``begun``: the machine drives, or may (it does not say), so that the decision is kept whatever
-    is seen. ``at_m``: travelled at the decision; ``since_m``: so far since then; both None where it does not say.
+    is seen. ``angle_deg`` None with a zone: a hold took the angle away, and the pass goes on.
+
+    ``at_m``: what the machine's count of travel was at the decision, None where it does not say; ``since_m``: travelled
+    since, as far as it said, None: it never did. ``silent_since_s``: since when it has not said how it drives.
     """
 
     zone: Zone | None = None
@@ -94,6 +97,7 @@ class Decision:
     begun: bool = False
     at_m: float | None = None
     since_m: float | None = None
+    silent_since_s: float | None = None
     standing_since_s: float | None = None
 
     @property
@@ -107,8 +111,12 @@ class Decision:
             return "no decision yet"
         if self.ended:
             return f"{self.zone}, until the next pass: {self.ended}"
-        since = f"{now_s - self.decided_s:.1f} s" if self.since_m is None else f"{self.since_m:.1f} m"
-        return f"{self.zone}, kept for this pass since {since}" if self.begun else f"{self.zone}, before the pass"
+        if not self.begun:
+            return f"{self.zone}, before the pass"
+        told = self.silent_since_s is None and self.since_m is not None
+        since = f"{self.since_m:.1f} m" if told else f"{now_s - self.decided_s:.1f} s"
+        held = "" if self.angle_deg is not None else "; held, until that is seen again"
+        return f"{self.zone}, kept for this pass since {since}{held}"
 
 
 Agreeing = Mapping[Zone, Sequence[SoilObservation]]
@@ -125,17 +133,19 @@ def decide(
     """Take one new observation (or None) into account and return the decision that now holds.
 
     ``settled`` is whether the blade stands at its goal: while it swings, votes are dropped, because the blade and the
-    soil are moving against each other. ``travel`` None: the machine does not say how it drives.
+    soil are moving against each other. So they are in reverse: what is seen ahead then is what the blade moves away
+    from. ``travel`` None: the machine does not say how it drives.
     """
-    votes = _votes(decision.votes, observation, now_s, rule) if settled else ()
+    votes = _votes(decision.votes, observation, now_s, rule) if settled and not _reverses(travel, rule) else ()
     if votes != decision.votes:
         decision = replace(decision, votes=votes)
     agreeing = _agreeing(votes, rule)
     decision = _pass(decision, agreeing, now_s, rule, travel)
-    if now_s - decision.decided_s < rule.dwell_s or not decision.votes:
-        return decision
-    winner = _winner(decision, agreeing, rule)
-    if winner is None or (winner is decision.zone and decision.kept):
+    winner = _winner(decision, agreeing, rule) if decision.votes else None
+    if winner is not None and winner is decision.zone and decision.kept:
+        # The same again; after a hold it gives the blade its angle back.
+        return decision if decision.angle_deg is not None else replace(decision, angle_deg=rule.angle_deg(winner))
+    if winner is None or now_s - decision.decided_s < rule.dwell_s:
         return decision
     drives = travel is None or abs(travel.speed_m_per_s) >= rule.standing_m_per_s
     return Decision(
@@ -145,7 +155,19 @@ def decide(
         begun=drives,
         at_m=travel.travelled_m if travel else None,
         since_m=0.0 if travel else None,
+        silent_since_s=None if travel else now_s,
     )
+
+
+def interrupted(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel | None = None) -> Decision:
+    """What a hold of the rotation leaves of a decision: no angle and no votes, for what moves afterwards was decided
+    afterwards; and the pass, in which nothing else is decided because a camera failed for a moment."""
+    decision = _pass(replace(decision, votes=()), {}, now_s, rule, travel)
+    return replace(decision, angle_deg=None) if decision.kept and decision.begun else Decision()
+
+
+def _reverses(travel: Travel | None, rule: RuleSettings) -> bool:
+    return travel is not None and travel.speed_m_per_s <= -rule.standing_m_per_s
 
 
 def _votes(
@@ -165,13 +187,13 @@ def _pass(decision: Decision, agreeing: Agreeing, now_s: float, rule: RuleSettin
     decision = _driven(decision, now_s, rule, travel)
     stood_s = 0.0 if decision.standing_since_s is None else now_s - decision.standing_since_s
     ended, gone = "", agreeing.get(Zone.NONE, ())
-    if travel is not None and travel.speed_m_per_s <= -rule.standing_m_per_s:
+    if _reverses(travel, rule):
         ended = "the machine reversed"
     elif decision.begun and stood_s >= rule.standing_s:
         ended = "the machine stands"
     elif decision.since_m is not None and decision.since_m >= rule.pass_m:
         ended = f"{rule.pass_m:g} m were travelled"
-    elif decision.since_m is None and now_s - decision.decided_s >= rule.pass_s:
+    elif decision.silent_since_s is not None and now_s - decision.silent_since_s >= rule.pass_s:
         ended = f"{rule.pass_s:g} s went by"
     elif gone and all(v.zone is Zone.NONE for v in gone):  # nor is any carried
         ended = "the soil is gone"
@@ -182,10 +204,12 @@ def _pass(decision: Decision, agreeing: Agreeing, now_s: float, rule: RuleSettin
 def _driven(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel | None) -> Decision:
     if travel is None:
         # Not said any more, or never: kept, since it may drive; from here on the time counts.
-        if decision.begun and decision.since_m is None and decision.standing_since_s is None:
+        if decision.silent_since_s is not None:
             return decision
-        return replace(decision, begun=True, at_m=None, since_m=None, standing_since_s=None)
-    at_m = travel.travelled_m if decision.at_m is None else decision.at_m
+        return replace(decision, begun=True, at_m=None, silent_since_s=now_s, standing_since_s=None)
+    at_m, since_m = decision.at_m, decision.since_m or 0.0
+    if at_m is None or travel.travelled_m < at_m + since_m:
+        at_m = travel.travelled_m - since_m  # it counts from somewhere else now, and the pass goes on
     since_m = travel.travelled_m - at_m
     drives = abs(travel.speed_m_per_s) >= rule.standing_m_per_s
     standing_since_s = None if drives else decision.standing_since_s if decision.standing_since_s is not None else now_s
@@ -194,6 +218,7 @@ def _driven(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel
         begun=decision.begun or drives,
         at_m=at_m,
         since_m=since_m,
+        silent_since_s=None,
         standing_since_s=standing_since_s,
     )
 
@@ -219,10 +244,11 @@ def _may_follow(decision: Decision, zone: Zone, agreeing: Sequence[SoilObservati
 
 
 def _agreeing(votes: tuple[SoilObservation, ...], rule: RuleSettings) -> Agreeing:
-    """The sure votes for what comes, by zone, where they are enough."""
+    """The sure votes for what comes, by zone, where they are enough; none where they are for two zones at once."""
     sure: dict[Zone, list[SoilObservation]] = {}
     for vote in votes:
         coming = vote.coming
         if coming.confidence >= rule.min_confidence:
             sure.setdefault(coming.zone, []).append(vote)
-    return {zone: of for zone, of in sure.items() if len(of) >= rule.votes_needed_n}
+    enough = {zone: of for zone, of in sure.items() if len(of) >= rule.votes_needed_n}
+    return enough if len(enough) == 1 else {}

@@ -103,7 +103,7 @@ class SoilStatus(_Status):
 
 class DecisionStatus(_Status):
     """What automatic operation decided last. ``kept``: it stands for a pass that is not over, for ``since_m`` so far
-    (null where the machine does not tell its travel)."""
+    as it told its travel (null where it never did). ``angle_deg`` null with a zone: a hold took it away in mid-pass."""
 
     zone: Zone | None = None
     angle_deg: float | None = None

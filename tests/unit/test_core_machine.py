@@ -15,7 +15,7 @@ from graderd.core import commands as cmd
 from graderd.core.axes import Goals, Pose
 from graderd.core.faults.monitor import ALL_AXES, ActiveFault, Clear, FaultRow, Reaction
 from graderd.core.machine import ARMED, Inputs, MachineSettings, Mode, State, Step, Unmet, step
-from graderd.core.rule import Decision, RuleSettings
+from graderd.core.rule import Decision, RuleSettings, Travel
 from graderd.core.soil import SoilObservation, Zone
 
 SETTINGS, RULE = MachineSettings(), RuleSettings()
@@ -316,8 +316,43 @@ def test_what_was_held_does_not_go_on_by_itself() -> None:
         assert not do(ended.state, cmd.Renew(client="a"), devices_active=True).replies[0].accepted
         turning = replace(AUTO, decision=Decision(Zone.LEFT, 30.0, NOW_S - 5.0), goals=Goals(rotation_deg=30.0))
         after = do(turning, devices_active=True, **held).state
-        assert after.decision == Decision()
+        assert (after.decision.angle_deg, after.decision.votes) == (None, ())
         assert do(after, devices_active=True).intents.goals.empty
+
+
+def test_a_camera_that_fails_for_a_moment_gives_no_second_decision_in_the_pass() -> None:
+    """It swung the blade from left to right across what it carried."""
+    blind = fault(Reaction.HOLD, frozenset({"rotation"}))
+    state, now_s = AUTO, NOW_S
+
+    def see(zone: Zone, faults: tuple[ActiveFault, ...] = ()) -> None:
+        nonlocal state, now_s
+        for _ in range(50):
+            now_s += 0.066
+            shares = (0.9, 0.1, 0.0) if zone is Zone.LEFT else (0.0, 0.1, 0.9)
+            seen = None if faults else SoilObservation(now_s, zone, 0.9, "", *shares)
+            travel = Travel(0.5, 0.5 * (now_s - NOW_S))
+            state = do(state, devices_active=True, observation=seen, now_s=now_s, faults=faults, travel=travel).state
+
+    see(Zone.LEFT)
+    assert state.goals == Goals(rotation_deg=30.0)
+    see(Zone.LEFT, (blind,))
+    assert state.goals.empty
+    see(Zone.RIGHT)
+    assert state.goals.empty
+    assert state.holding == ("held in mid-pass: left not seen again",)
+    assert state.decision.reason(now_s).endswith("held, until that is seen again")
+    since_m = state.decision.since_m
+    see(Zone.LEFT)
+    assert state.goals == Goals(rotation_deg=30.0)
+    assert (state.decision.since_m or 0.0) > (since_m or 0.0) > 4.0
+
+
+def test_a_hold_before_the_pass_leaves_all_open() -> None:
+    standing = Travel(0.0, 0.0)
+    turning = replace(AUTO, decision=Decision(Zone.LEFT, 30.0, NOW_S - 5.0, at_m=0.0, since_m=0.0))
+    after = do(turning, devices_active=True, held={"rotation": "it is far"}, travel=standing).state
+    assert after.decision == Decision()
 
 
 def test_a_preset_that_stands_short_of_a_stage_ends() -> None:

@@ -116,7 +116,12 @@ def canonical(state: State, passed_s: float) -> State:
         holding=(),
         arming_since_s=None if state.arming_since_s is None else relative(state.arming_since_s),
         lease=None if state.lease is None else Lease(state.lease.client, relative(state.lease.expires_s)),
-        decision=replace(state.decision, decided_s=relative(state.decision.decided_s), votes=votes),
+        decision=replace(
+            state.decision,
+            decided_s=relative(state.decision.decided_s),
+            silent_since_s=None if state.decision.silent_since_s is None else relative(state.decision.silent_since_s),
+            votes=votes,
+        ),
     )
 
 

@@ -263,9 +263,50 @@ def test_a_speed_that_is_lost_in_mid_pass_keeps_the_decision() -> None:
         now_s += 0.066
         decision = decide(decision, apart(Zone.RIGHT, SPREAD, now_s), True, now_s, RULE, None)
     assert decision.zone is Zone.LEFT
-    # Back again, counting from somewhere else: the pass goes on from here.
+    # Back again, counting from somewhere else: the pass goes on from what was known.
+    told_m = decision.since_m
     decision = decide(decision, None, True, now_s + 0.02, RULE, Travel(0.5, 0.0))
-    assert (decision.kept, decision.since_m) == (True, 0.0)
+    assert (decision.kept, decision.since_m) == (True, told_m)
+
+
+def test_a_speed_that_is_lost_for_a_moment_late_in_a_slow_pass_keeps_the_decision() -> None:
+    """The time rule counted from the decision, and one lost reading after 40 s ended the pass."""
+    decision, at = drive(Decision(), Zone.LEFT, metres=8.0, speed=0.2)
+    decision = decide(decision, None, True, at[0] + 0.02, RULE, None)
+    decision, at = drive(decision, Zone.RIGHT, SPREAD, speed=0.2, at=at)
+    assert (decision.zone, decision.kept) == (Zone.LEFT, True)
+    lost_s = at[0] + 0.02
+    decision = decide(decision, None, True, lost_s, RULE, None)
+    assert decide(decision, None, True, lost_s + RULE.pass_s - 0.1, RULE, None).kept
+    assert decide(decision, None, True, lost_s + RULE.pass_s, RULE, None).ended == "32 s went by"
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_travel_that_is_lost_or_counts_anew_does_not_make_the_pass_longer(lost: bool) -> None:
+    decision, at = drive(Decision(), Zone.LEFT, metres=6.0)
+    if lost:
+        decision = decide(decision, None, True, at[0] + 0.02, RULE, None)
+    decision, at = drive(decision, Zone.NONE, SPREAD, metres=RULE.pass_m - 5.5, at=(at[0], 0.0))
+    assert decision.ended == "10 m were travelled"
+
+
+def test_nothing_is_decided_in_reverse() -> None:
+    """What is seen ahead is then what the blade moves away from: it swung from side to side all the way back."""
+    decision, at = drive(Decision(), Zone.LEFT)
+    for zone in (Zone.RIGHT, Zone.EVEN, Zone.LEFT, Zone.RIGHT):
+        decision, at = drive(decision, zone, metres=-1.0, speed=-0.3, at=at)
+        assert (decision.zone, decision.ended, decision.votes) == (Zone.LEFT, "the machine reversed", ())
+    decision, at = drive(decision, Zone.RIGHT, at=at)
+    assert (decision.zone, decision.kept) == (Zone.RIGHT, True)
+
+
+def test_as_many_votes_for_one_side_as_for_the_other_decide_nothing() -> None:
+    rule = RuleSettings(votes_needed_n=3, votes_window_n=6)
+    for last in (Zone.RIGHT, Zone.LEFT):
+        votes = tuple(seen(zone, 0.0) for zone in (Zone.RIGHT, Zone.LEFT, Zone.RIGHT, Zone.LEFT, last))
+        other = Zone.LEFT if last is Zone.RIGHT else Zone.RIGHT
+        assert decide(Decision(votes=votes), seen(other, 0.1), True, 0.1, rule).zone is None
+        assert decide(Decision(votes=votes), seen(last, 0.1), True, 0.1, rule).zone is last
 
 
 def test_the_swing_of_the_blade_does_not_hide_the_end_of_the_pass() -> None:
