@@ -293,12 +293,18 @@ class FrameSetWriter:
     """Writes a frame set as the frames come: a stopped run leaves a valid set behind."""
 
     def __init__(
-        self, folder: Path, calibration: CameraCalibration, blade: BladeGeometry, extra_columns: tuple[str, ...] = ()
+        self,
+        folder: Path,
+        calibration: CameraCalibration,
+        blade: BladeGeometry,
+        extra_columns: tuple[str, ...] = (),
+        *,
+        with_depth: bool = True,
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._extra = extra_columns
-        self._camera = camera_json(calibration, blade)
+        self._camera = camera_json(calibration, blade, with_depth)
         (folder / CAMERA).write_text(json.dumps(self._camera, indent=1) + "\n", encoding="utf-8")
         with (folder / MANIFEST).open("w", encoding="utf-8", newline="") as file:
             csv.writer(file).writerow((*COLUMNS, *ATTITUDE_COLUMNS, *extra_columns))
@@ -316,6 +322,29 @@ class FrameSetWriter:
         row += [entry.extra.get(column, "") for column in self._extra]
         with (self._folder / MANIFEST).open("a", encoding="utf-8", newline="") as file:
             csv.writer(file).writerow(row)
+
+
+def write_label(folder: Path, id_: str, label: Zone | None) -> None:
+    """Put a frame's label into the manifest, or take it away; everything else in it stays. Whole or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+        KeyError: no frame of that id.
+    """
+    path = folder / MANIFEST
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        reader = csv.DictReader(file)
+        names, lines = list(reader.fieldnames or ()), list(reader)
+    if "label" not in names:
+        names.insert(1, "label")
+    by_id = {line["id"].strip(): line for line in lines}
+    by_id[id_]["label"] = label or ""
+    new = path.with_suffix(".new")
+    with new.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(lines)
+    new.replace(path)
 
 
 class FrameSetCamera:

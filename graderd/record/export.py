@@ -50,7 +50,7 @@ def export(recording: Recording, folder: Path) -> dict[str, int]:
                 found["log_lines_n"] += len(lines)
     whole.finish()
     if recording.frame_files:
-        found["frames_n"] = _export_frames(recording, folder / "frames")
+        found["frames_n"] = export_frames(recording, folder / "frames")
     return found
 
 
@@ -82,8 +82,8 @@ def _frames_in(recording: Recording) -> Iterator[Judged]:
         yield judged_of(frame, color, None)
 
 
-def _export_frames(recording: Recording, folder: Path) -> int:
-    """As a frame set, for ``graderd classify`` and ``graderd label``."""
+def export_frames(recording: Recording, folder: Path) -> int:
+    """The raw frames as a frame set, for ``graderd classify`` and ``graderd label``; returns how many."""
     writer, count_n = None, 0
     for judged in raw_frames(recording):
         frame = judged.frame
