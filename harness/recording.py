@@ -75,7 +75,8 @@ class Feed:
 
 
 def record_until_killed(folder: Path, after_s: float) -> float:
-    """Have another process record into ``folder``, kill it after so long, and return how much its file lacks, seconds.
+    """Have another process record into ``folder``, kill it so long after its first tick, and return how much of what it
+    ticked its file lacks, seconds.
 
     Raises:
         AssertionError: it left no file that reads.
@@ -83,14 +84,15 @@ def record_until_killed(folder: Path, after_s: float) -> float:
     command = [sys.executable, "-m", "harness.recording", str(folder)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
-        process.stdout.readline()  # it ticks
-        time.sleep(after_s)
-        killed_s = time.monotonic()
+        first_s = last_s = float(process.stdout.readline())
+        while last_s - first_s < after_s:
+            last_s = float(process.stdout.readline())
         process.send_signal(signal.SIGKILL)
+        ticked = process.stdout.read().split(b"\n")[:-1]  # what came after its last line end is no whole line
+    last_s = float(ticked[-1]) if ticked else last_s
     (path,) = folder.glob("*.mcap")
-    ticks = list(Recording(path).messages((TICK,)))
-    assert ticks, "nothing was kept"
-    return max(0.0, killed_s - float(said(ticks[-1])["now_s"]))
+    kept_s = [float(said(message)["now_s"]) for message in Recording(path).messages((TICK,))]
+    return last_s - (kept_s[-1] if kept_s else first_s)
 
 
 def record_in_virtual_time(folder: Path, seconds: float) -> Path:
@@ -141,13 +143,10 @@ def _later(sensed: Sensed, now_s: float) -> Sensed:
 async def _record(folder: Path) -> None:
     feed = Feed(folder)
     task = asyncio.create_task(feed.recorder.run())
-    feed.tick()
-    sys.stdout.write("ticking\n")
-    sys.stdout.flush()
-    while True:
-        await feed.ticks(1.0)
-        if task.done():
-            return
+    while not task.done():
+        await feed.ticks(TICK_S)
+        sys.stdout.write(f"{feed.now_s}\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":
