@@ -312,11 +312,9 @@ def rotation_from_angles(
     """Rotation (3x3, optical to vehicle) of a camera that is rolled, then pitched, then yawed."""
     heading = 180.0 if mounting == "facing_blade_from_front" else 0.0
     pitch, yaw, roll = (math.radians(angle) for angle in (pitch_down_deg, yaw_deg + heading, roll_deg))
-    ahead = np.array([math.cos(pitch), 0.0, -math.sin(pitch)])
-    right = np.array([0.0, -1.0, 0.0])
-    down = np.cross(ahead, right)
-    c, s = math.cos(roll), math.sin(roll)
-    unturned = np.column_stack((right * c + down * s, down * c - right * s, ahead))
+    cp, sp, c, s = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
+    # Columns: right (0, -1, 0) and down (-sp, 0, -cp), rolled about the line of sight, which is the third.
+    unturned = np.array([[-sp * s, -sp * c, cp], [-c, s, 0.0], [-cp * s, -cp * c, -sp]])
     turn = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     return np.asarray(turn @ unturned, dtype=np.float64)
 

@@ -8,6 +8,7 @@ import math
 import os
 import shlex
 import signal
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -300,3 +301,17 @@ async def test_a_frozen_daemon_is_told(tmp_path: Path, capsys: Capture) -> None:
     async with serving(tmp_path, daemon, limits=limits) as (_, path):
         assert await cli(path, "jog", "rotate", "+5deg") == 1
         assert "the control tick did not answer" in capsys.readouterr().err
+
+
+def test_numpy_computes_with_one_thread_in_each_process_that_the_command_line_starts() -> None:
+    """Said before numpy is imported, so that this process hears it too; what somebody else said stays."""
+    program = (
+        "import os, subprocess, sys\nfrom graderd.cli import main\nassert 'numpy' not in sys.modules\n"
+        "try:\n    main(['--help'])\nexcept SystemExit: pass\n"
+        "sys.stderr.write(subprocess.check_output(['printenv', 'OPENBLAS_NUM_THREADS'], text=True))"
+    )
+    for said in ("", "3"):
+        environment = {key: value for key, value in os.environ.items() if key != "OPENBLAS_NUM_THREADS"}
+        environment |= {"OPENBLAS_NUM_THREADS": said} if said else {}
+        done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+        assert done.stderr.strip() == (said or "1")
