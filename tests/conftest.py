@@ -7,8 +7,10 @@ import gc
 import inspect
 import signal
 from collections.abc import AsyncIterator
+from pathlib import Path
 
 import pytest
+from _pytest.nodeid import NodeId
 from hypothesis import HealthCheck, settings
 
 # Loaded machines draw slowly: no test of ours may depend on that. The same examples every time, so that a green commit
@@ -23,11 +25,25 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Every asynchronous test gets the check for leaked tasks; synchronous ones need no event loop."""
+UNIT = Path(__file__).with_name("unit")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """A unit test that is not ``live`` is ``pure``; whole machines take turns, in two groups, whatever else runs beside
+    them; every asynchronous test gets the check for leaked tasks, synchronous ones need no event loop."""
     for item in items:
+        if UNIT in item.path.parents and not item.get_closest_marker("live"):
+            item.add_marker("pure")
+        if item.get_closest_marker("whole_machine") and not item.get_closest_marker("xdist_group"):
+            item.add_marker(pytest.mark.xdist_group("whole machine"))
         if isinstance(item, pytest.Function) and inspect.iscoroutinefunction(item.obj):
             item.fixturenames.insert(0, "no_leaked_tasks")
+        group = item.get_closest_marker("xdist_group")
+        if group and getattr(config.option, "loadgroup", False):
+            # xdist 3.8 writes the group where pytest 9.2 no longer looks: no group was kept together, nothing said so.
+            item._id = NodeId.parse(f"{item.nodeid}@{group.args[0]}")
+            assert item.nodeid.endswith(f"@{group.args[0]}")
 
 
 def pytest_collection_finish() -> None:

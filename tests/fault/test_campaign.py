@@ -110,6 +110,7 @@ async def test_every_process_of_a_campaign_is_bound_to_it(monkeypatch: pytest.Mo
 
 
 @pytest.mark.whole_machine
+@pytest.mark.xdist_group("beside a machine")
 @pytest.mark.timeout(SHORT_S + 60.0)
 @pytest.mark.parametrize("part", [(1, 2), (2, 2)])
 async def test_the_shortened_campaign_passes(part: tuple[int, int]) -> None:
@@ -129,6 +130,7 @@ async def test_the_shortened_campaign_passes(part: tuple[int, int]) -> None:
 
 
 @pytest.mark.whole_machine
+@pytest.mark.xdist_group("beside a machine")
 @pytest.mark.timeout(120.0)
 @pytest.mark.parametrize(
     ("broken", "fault", "phase", "told"),

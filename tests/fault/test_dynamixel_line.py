@@ -31,7 +31,8 @@ async def bus(rig: Bench) -> AsyncIterator[ServoBus]:
     made.close()
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
+@pytest.mark.xdist_group("beside a machine")
 @pytest.mark.timeout(60)
 async def test_15_percent_loss_is_told_and_nothing_else_happens(tmp_path: Path) -> None:
     """As many exchanges as in a minute at the default poll rate."""

@@ -21,7 +21,7 @@ from harness.campaign.model import Phase
 from harness.campaign.stack import Stack
 from harness.stops import WAYS, by_stop_request, stopped_in_motion
 
-pytestmark = [pytest.mark.whole_machine, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.whole_machine, pytest.mark.xdist_group("beside a machine"), pytest.mark.timeout(240)]
 
 WIRES_S = 0.5
 """Promised: a tick (20 ms) and the wire's time. Allowed: what a machine may take that runs everything on two cores."""

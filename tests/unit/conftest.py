@@ -22,9 +22,8 @@ sys.addaudithook(_refuse)
 
 @pytest.fixture(autouse=True)
 def as_marked(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Hold the test to its mark, where the marks choose: `make unit`."""
+    """Hold the test to its mark: one that is ``pure`` runs beside whole machines, and in `make unit`."""
     global _judged
-    chosen = "not live" in str(request.config.getoption("markexpr"))
-    _judged = request.node.nodeid if chosen and not request.node.get_closest_marker("live") else ""
+    _judged = request.node.nodeid if request.node.get_closest_marker("pure") else ""
     yield
     _judged = ""

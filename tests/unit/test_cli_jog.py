@@ -313,5 +313,6 @@ def test_numpy_computes_with_one_thread_in_each_process_that_the_command_line_st
     for said in ("", "3"):
         environment = {key: value for key, value in os.environ.items() if key != "OPENBLAS_NUM_THREADS"}
         environment |= {"OPENBLAS_NUM_THREADS": said} if said else {}
-        done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+        command = [sys.executable, "-c", program]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
         assert done.stderr.strip() == (said or "1")

@@ -30,7 +30,8 @@ from rustypot import Xl430PyController
 
 from tests.dynamixel_sim import TIMEOUT_S, ServoProcess, servo_process
 
-pytestmark = pytest.mark.whole_machine  # the SDK gives up after 34 ms, and is asked again
+# The SDK gives up after 34 ms, and is asked again.
+pytestmark = [pytest.mark.whole_machine, pytest.mark.xdist_group("beside a machine")]
 IDS = (1, 3, 7)
 STUFFED = -131073  # FF FF FD FF on the wire: the payload that must be stuffed
 T = TypeVar("T")
