@@ -8,6 +8,7 @@ from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, 
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -348,22 +349,40 @@ async def serving(
 
 @dataclass
 class Hold:
-    """``longest_s``: what was computed between two of our own turns in the event loop, the longest of them."""
+    """How an event loop kept one of its tasks waiting, in computing time of its thread: waiting for a processor that
+    others have is not counted, whatever the machine is busy with.
 
-    longest_s: float = 0.0
+    ``looked``: at each turn of a task that sleeps for a tick, monotonic seconds and what the thread had computed.
+    """
+
+    looked: list[tuple[float, float]] = field(default_factory=list)
+
+    @property
+    def each_s(self) -> list[float]:
+        """What was computed between two turns, in order."""
+        return [after - before for (_, before), (_, after) in pairwise(self.looked)]
+
+    @property
+    def longest_s(self) -> float:
+        """The most that was computed between two turns."""
+        return max(self.each_s, default=0.0)
+
+    def computed_s(self, from_s: float, to_s: float) -> float:
+        """What was computed between two monotonic times, all of a turn's that they are in."""
+        before = [computed for at_s, computed in self.looked if at_s <= from_s]
+        after = [computed for at_s, computed in self.looked if at_s >= to_s]
+        return (after or [self.looked[-1][1]])[0] - (before or [self.looked[0][1]])[-1]
 
 
 @asynccontextmanager
 async def longest_hold() -> AsyncIterator[Hold]:
-    """How long the event loop keeps a task waiting that sleeps for a tick, in computing time of this thread: waiting
-    for a processor that others have is not counted."""
+    """Look from now on."""
     hold = Hold()
 
     async def look() -> None:
         while True:
-            before_s = time.thread_time()
+            hold.looked.append((time.monotonic(), time.thread_time()))
             await asyncio.sleep(TICK_S)
-            hold.longest_s = max(hold.longest_s, time.thread_time() - before_s)
 
     looking = asyncio.create_task(look(), name="longest hold")
     try:

@@ -13,12 +13,13 @@ from graderd.api.settings import ApiLimits
 from graderd.api.stop_socket import stop_socket_beside
 from graderd.core.machine import Mode
 from graderd.hal.clock import Pace
-from harness.api_daemon import TICK_S, serving, within
+from harness.api_daemon import TICK_S, longest_hold, serving, within
 from tests.unit.test_cli_modes import command_line
 
 pytestmark = pytest.mark.live
 
 FLOOD_S = 2.5
+"""Floods are ``nice``: they take what there is, from the daemon under test before all, not from what runs beside it."""
 
 
 def test_the_pace_lets_a_burst_through_and_then_one_by_one() -> None:
@@ -28,21 +29,18 @@ def test_the_pace_lets_a_burst_through_and_then_one_by_one() -> None:
     assert [round(pace.delay_s(200.0), 6) for _ in range(3)] == [0.0, 0.0, 0.1]
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 @pytest.mark.parametrize(("kind", "connections_n"), [("ask", 100), ("ask", 300), ("hammer", 50)])
 async def test_the_tick_goes_on_and_stop_gets_through(
     tmp_path: Path, kind: str, connections_n: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with serving(tmp_path) as (daemon, path):
-        await daemon.until(lambda: len(daemon.late_s) > 40)
-        # How late ticks come before the flood: this machine may be busy with other things.
-        quiet_s = sorted(daemon.late_s)[36]
+    async with serving(tmp_path) as (daemon, path), longest_hold() as hold:
         flood = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "harness.api_flood", str(path), str(FLOOD_S), kind, str(connections_n)),
+            *("nice", sys.executable, "-m", "harness.api_flood", str(path), str(FLOOD_S), kind, str(connections_n)),
             stdout=asyncio.subprocess.PIPE,
         )
         await asyncio.sleep(1.0)  # the flood's own start
-        daemon.late_s.clear()
+        hold.looked.clear()
         stop = await asyncio.create_subprocess_exec(
             *command_line(path, "stop", "--reason", "flooded"), stdout=asyncio.subprocess.DEVNULL
         )
@@ -52,14 +50,14 @@ async def test_the_tick_goes_on_and_stop_gets_through(
         assert flood.stdout is not None
         counts = json.loads(await within(30, flood.stdout.read()))
         await flood.wait()
-        late_s = sorted(daemon.late_s)
+        each_s = sorted(hold.each_s)
     assert "flooded" in daemon.state.reason
     assert counts["sent"] > 300
     if kind == "ask":
         assert counts["503"] > 0
-    # Without the limits the median itself is about a tick and more.
-    assert late_s[len(late_s) // 2] < TICK_S / 2 + quiet_s
-    assert late_s[int(len(late_s) * 0.9)] < 3 * TICK_S + 2 * quiet_s
+    # A loop that has no moment to spare computes a tick's time from one tick to the next; what is more made it late.
+    assert each_s[len(each_s) // 2] < 1.5 * TICK_S
+    assert each_s[int(len(each_s) * 0.9)] < 4 * TICK_S
     limits = ApiLimits()
     assert tasks_n < 3 * limits.connections_max_n
     assert [record for record in caplog.records if record.levelname in ("ERROR", "CRITICAL")] == []
@@ -72,41 +70,46 @@ with socket.socket(socket.AF_UNIX) as connection:
     connection.connect(sys.argv[1])
     connection.sendall(b"flooded")
     answer = connection.recv(4096)
-print(time.monotonic() - began_s, answer.split()[1].decode())
+print(began_s, time.monotonic(), answer.split()[1].decode())
 """
-STOP_S = 0.1
+STOP_S, ON_A_BUSY_MACHINE_S = 0.1, 2.0
+"""What the daemon may compute until a stop is answered, a tick before and after it included; and what may pass by."""
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 @pytest.mark.parametrize(("kind", "connections_n"), [("ask", 400), ("hammer", 50), ("stop", 400)])
 async def test_the_stop_socket_is_nobodys_queue(tmp_path: Path, kind: str, connections_n: int) -> None:
     """From a new process's connect to its answer, beside clients that fill the queue of the interface itself."""
-    async with serving(tmp_path) as (daemon, path):
+    async with serving(tmp_path) as (daemon, path), longest_hold() as hold:
         flood = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "harness.api_flood", str(path), "4", kind, str(connections_n)),
+            *("nice", sys.executable, "-m", "harness.api_flood", str(path), "4", kind, str(connections_n)),
             stdout=asyncio.subprocess.PIPE,
         )
         await asyncio.sleep(1.5)  # the flood's own start
-        took_s = []
+        took_s, computed_s = [], []
         for _ in range(5):
             stop = await asyncio.create_subprocess_exec(
                 *(sys.executable, "-S", "-c", COLD, str(stop_socket_beside(path))), stdout=asyncio.subprocess.PIPE
             )
             told, _ = await within(20, stop.communicate())
-            assert told.split()[1] == b"200"
-            took_s.append(float(told.split()[0]))
+            began_s, answered_s, status_code = told.split()
+            assert status_code == b"200"
+            took_s.append(float(answered_s) - float(began_s))
+            await asyncio.sleep(TICK_S)  # another look
+            computed_s.append(hold.computed_s(float(began_s), float(answered_s)))
         assert daemon.state.mode is Mode.STOPPED
         assert flood.stdout is not None
         await within(30, flood.stdout.read())
         await flood.wait()
-    assert sorted(took_s)[2] < STOP_S, took_s
+    assert sorted(computed_s)[2] < STOP_S, computed_s
+    assert sorted(took_s)[2] < ON_A_BUSY_MACHINE_S, took_s
 
 
-@pytest.mark.serial_only
+@pytest.mark.whole_machine
 async def test_a_flood_of_stops_is_served_at_its_own_pace(tmp_path: Path) -> None:
     async with serving(tmp_path) as (daemon, path):
         flood = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "harness.api_flood", str(path), "2", "stop", "50"),
+            *("nice", sys.executable, "-m", "harness.api_flood", str(path), "2", "stop", "50"),
             stdout=asyncio.subprocess.PIPE,
         )
         assert flood.stdout is not None

@@ -1,8 +1,8 @@
 """Floods one WebSocket, as a process of its own: ``python -m tests.unit.ws_flood TARGET PATH KIND N SECONDS``.
 
 TARGET: a unix socket's path, or HOST:PORT:TOKEN. KIND ``stop`` or ``ping``: N such frames, written as fast as the
-daemon takes them. Answers to stops are read and thrown away, those to pings never read. After SECONDS the process ends
-without a word.
+daemon takes them, pings with as many bytes as one may have. Answers to stops are read and thrown away, those to pings
+never read. After SECONDS the process ends without a word.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def main() -> None:
     connection.settimeout(float(seconds))
     if kind == "stop":
         threading.Thread(target=read_all, args=(connection,), daemon=True).start()
-    one = frame(1, STOP) if kind == "stop" else frame(9, b"")
+    one = frame(1, STOP) if kind == "stop" else frame(9, b"p" * 125)
     try:
         connection.sendall(one * int(frames_n))
     except (TimeoutError, ConnectionError):
