@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
 import sys
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,17 +15,44 @@ from graderd.client import AsyncClient, NoDaemonError
 from graderd.core.commands import Reply
 from graderd.core.status import Status
 from graderd.simulator.control_client import RigControl
+from tests.rig_process import running_rig
 
 READY_S = 60.0
+CONFIG = """\
+[api]
+socket = "{socket}"
+[camera]
+rate_hz = 6.0
+color_width_px = 320
+color_height_px = 200
+"""
+"""Few and small pictures: nobody here looks at them but perception, which sees soil in them all the same."""
+
+PATIENT = """\
+[machine]
+lease_s = 1.0
+[control]
+overrun_s = 0.3
+[rotation]
+watchdog_s = 0.4
+goal_timeout_s = 0.4
+reply_timeout_s = 0.5
+max_age_s = 0.4
+[lift_pair]
+silent_s = 0.4
+reading_max_age_s = 0.6
+""" + "\n".join(
+    f"[{axis}]\nmax_age_s = 0.6\nfeedback_timeout_s = 0.6\ntarget_timeout_s = 0.5"
+    for axis in ("lift_left", "lift_right", "tilt")
+)
+"""Twice the patience with all that moves, where no time is judged: a busy machine is no fault of the grader's."""
 
 
 @dataclass
-class Machine:
-    """A rig and a daemon attached to it, as processes of their own."""
+class Served:
+    """A machine that is there, wherever its processes came from; a client of its daemon, the rig's control beside."""
 
     directory: Path
-    rig: asyncio.subprocess.Process
-    daemon: asyncio.subprocess.Process
     client: AsyncClient
 
     async def status(self) -> Status:
@@ -53,6 +81,14 @@ class Machine:
         await self.until(lambda s: (s.axes["rotation"].measured or 0.0) > 8.0)
 
 
+@dataclass
+class Machine(Served):
+    """A rig and a daemon attached to it, as processes of their own, to be ended as a test likes."""
+
+    rig: asyncio.subprocess.Process
+    daemon: asyncio.subprocess.Process
+
+
 async def start_rig(directory: Path) -> asyncio.subprocess.Process:
     """A rig in ``directory``, ready."""
     (directory / "rig.json").unlink(missing_ok=True)
@@ -69,13 +105,13 @@ async def machine(directory: Path, more_config: str = "") -> AsyncIterator[Machi
     """Start both, give the machine, end both whatever happened. ``more_config`` is further TOML."""
     rig = await start_rig(directory)
     socket_path = directory / "graderd.sock"
-    (directory / "graderd.toml").write_text(f'[api]\nsocket = "{socket_path}"\n{more_config}', encoding="utf-8")
+    (directory / "graderd.toml").write_text(CONFIG.format(socket=socket_path) + more_config, encoding="utf-8")
     daemon = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "graderd", "run"),
         *("--config", str(directory / "graderd.toml"), "--rig-dir", str(directory)),
     )
     async with AsyncClient(socket_path, name="test", timeout_s=10.0) as client:
-        whole = Machine(directory, rig, daemon, client)
+        whole = Machine(directory, client, rig, daemon)
         try:
             yield whole
         finally:
@@ -83,3 +119,17 @@ async def machine(directory: Path, more_config: str = "") -> AsyncIterator[Machi
                 if process.returncode is None:
                     process.kill()
                 await process.wait()
+
+
+@contextmanager
+def standing_machine(directory: Path) -> Iterator[Served]:
+    """A patient one for several tests, each with an event loop of its own, which leave it armed or not, but alive."""
+    socket_path = directory / "graderd.sock"
+    (directory / "graderd.toml").write_text(CONFIG.format(socket=socket_path) + PATIENT, encoding="utf-8")
+    words = ("run", "--config", str(directory / "graderd.toml"), "--rig-dir", str(directory))
+    with running_rig(directory), subprocess.Popen([sys.executable, "-m", "graderd", *words]) as daemon:
+        try:
+            yield Served(directory, AsyncClient(socket_path, name="test", timeout_s=10.0))
+            assert daemon.poll() is None
+        finally:
+            daemon.kill()

@@ -7,10 +7,12 @@ import json
 import os
 import re
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,37 +33,51 @@ def short_path() -> Iterator[Path]:
         yield Path(folder)
 
 
-async def test_the_demonstration_turns_the_blade_by_what_the_camera_sees() -> None:
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "graderd", "demo", "--json"), stdout=asyncio.subprocess.PIPE
-    )
-    out, _ = await process.communicate()
-    events = [json.loads(line) for line in out.splitlines()]
-    assert process.returncode == 0, events[-5:]
-    last = events[-1]
-    assert last["event"] == "demo_finished"
-    reached = {one["zone"]: (one["requested_deg"], one["measured_deg"]) for one in last["passes"]}
-    assert {zone: requested for zone, (requested, _) in reached.items()} == {
-        "left": 30.0, "center": 15.0, "right": -30.0, "even": 45.0
-    }  # fmt: skip
-    for requested_deg, measured_deg in reached.values():
-        assert measured_deg == pytest.approx(requested_deg, abs=0.5)
+@dataclass(frozen=True)
+class Demonstrations:
+    """Two that ran beside each other: each one's events and exit status, and what they left behind."""
+
+    events: list[list[dict[str, Any]]]
+    statuses: list[int | None]
+    left: list[Path]
 
 
-async def test_two_demonstrations_beside_each_other_pass(short_path: Path) -> None:
-    """Two checkouts, or two users: nothing of one is the other's, whatever the place for run-time files."""
-    environment = {**os.environ, "XDG_RUNTIME_DIR": str(short_path)}
-    demonstrations = [
-        await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "graderd", "demo", "--json"), stdout=asyncio.subprocess.PIPE, env=environment
-        )
-        for _ in range(2)
-    ]
-    for out, _ in await asyncio.gather(*(process.communicate() for process in demonstrations)):
-        last = json.loads(out.splitlines()[-1])
-        assert [one["decided"] for one in last["passes"]] == ["left", "center", "right", "even"], last
-    assert [process.returncode for process in demonstrations] == [0, 0]
-    assert list(short_path.iterdir()) == []
+@pytest.fixture(scope="module")
+def two_demonstrations() -> Iterator[Demonstrations]:
+    """Two checkouts, or two users, with one place for run-time files."""
+    with tempfile.TemporaryDirectory(prefix="graderd-test-") as folder:
+        running = [
+            subprocess.Popen(
+                [sys.executable, "-m", "graderd", "demo", "--json"],
+                stdout=subprocess.PIPE,
+                env={**os.environ, "XDG_RUNTIME_DIR": folder},
+            )
+            for _ in range(2)
+        ]
+        said = [process.communicate()[0] for process in running]  # a pipe holds all that one says
+        events = [[json.loads(line) for line in out.splitlines()] for out in said]
+        yield Demonstrations(events, [process.returncode for process in running], list(Path(folder).iterdir()))
+
+
+def test_the_demonstration_turns_the_blade_by_what_the_camera_sees(two_demonstrations: Demonstrations) -> None:
+    for events, status in zip(two_demonstrations.events, two_demonstrations.statuses, strict=True):
+        assert status == 0, events[-5:]
+        last = events[-1]
+        assert last["event"] == "demo_finished"
+        reached = {one["zone"]: (one["requested_deg"], one["measured_deg"]) for one in last["passes"]}
+        assert {zone: requested for zone, (requested, _) in reached.items()} == {
+            "left": 30.0, "center": 15.0, "right": -30.0, "even": 45.0
+        }  # fmt: skip
+        for requested_deg, measured_deg in reached.values():
+            assert measured_deg == pytest.approx(requested_deg, abs=0.5)
+
+
+def test_two_demonstrations_beside_each_other_pass(two_demonstrations: Demonstrations) -> None:
+    """Nothing of one is the other's, whatever the place for run-time files."""
+    for events in two_demonstrations.events:
+        assert [one["decided"] for one in events[-1]["passes"]] == ["left", "center", "right", "even"], events[-1]
+    assert two_demonstrations.statuses == [0, 0]
+    assert two_demonstrations.left == []
 
 
 async def test_a_demonstration_that_fails_says_why_in_its_last_event(short_path: Path) -> None:

@@ -99,7 +99,7 @@ def test_rig_killed_takes_its_camera_along_and_clients_know_at_once(tmp_path: Pa
             except DeviceLostError as error:
                 lost = error
         assert "hung up" in str(lost)
-        assert time.monotonic() - killed_s < 0.5
+        assert time.monotonic() - killed_s < 2.0
         assert gone_within(camera_pid, 1.0)
         assert not os.path.exists(servo_pty)
         with pytest.raises(DeviceMissingError):

@@ -15,19 +15,23 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from graderd.client import Client, ClientError
+from graderd.core.status import Status
 from tests.unit.test_cli_offline import leaf_commands
 from tests.users import CONFIG, DAEMON, OPERATOR, ROOT, STATE, STRANGER, Machine, environment, three_users
 
 # One machine for all of them; none measures time.
-pytestmark = [pytest.mark.xdist_group("three users"), pytest.mark.whole_machine, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.whole_machine, pytest.mark.xdist_group("beside a machine"), pytest.mark.timeout(600)]
 READY_S = 120.0
 POSE = "0.9,0.05,0.6,30,1,-1"
 USERS = (DAEMON, OPERATOR, STRANGER)
+GRADERD = (sys.executable, "-P", "-m", "graderd")
 
 
 @pytest.fixture(scope="module")
@@ -58,22 +62,30 @@ def configuration(machine: Machine, original: str) -> None:
 class Service:
     """The daemon as the unit starts it, on the simulated grader."""
 
-    def __init__(self, machine: Machine, *grader: str) -> None:
+    def __init__(self, machine: Machine, *grader: str, socket: str = "/run/graderd/graderd.sock") -> None:
         self.machine = machine
-        words = [sys.executable, "-P", "-m", "graderd", "run", "--config", str(CONFIG), *(grader or ["--sim"])]
+        self.client = Client(Path(f"/proc/{machine.holder_pid}/root{socket}"), name="test")
+        words = [*GRADERD, "run", "--config", str(CONFIG), *(grader or ["--sim"])]
         command = machine.command(DAEMON, *words)
         self.log = tempfile.TemporaryFile("w+")  # noqa: SIM115  (until end)
         self.process = subprocess.Popen(command, env=environment(DAEMON), stderr=self.log)
 
-    def until(self, reached: Callable[[dict[str, Any]], bool], user: str = OPERATOR) -> dict[str, Any]:
+    def until(self, reached: Callable[[Status], bool]) -> None:
+        """Wait for a status, which is looked at from outside: a command line for each look would keep the machine busy
+        with nothing else."""
         give_up_s = time.monotonic() + READY_S
         while True:
             assert self.process.poll() is None, self._said()
-            answer = self.machine.graderd(user, "status", "--json")
-            state: dict[str, Any] = json.loads(answer.stdout) if answer.returncode == 0 else {}
-            if state and reached(state):
-                return state
-            assert time.monotonic() < give_up_s, (answer, self._said())
+            with suppress(ClientError):
+                if reached(self.client.status()):
+                    return
+            assert time.monotonic() < give_up_s, self._said()
+            time.sleep(0.05)
+
+    def status(self, user: str = OPERATOR) -> dict[str, Any]:
+        """What ``user`` is told by the command line."""
+        told: dict[str, Any] = json.loads(self.machine.must(user, *GRADERD, "status", "--json"))
+        return told
 
     def _said(self) -> str:
         self.log.seek(0)
@@ -90,7 +102,7 @@ def service(machine: Machine) -> Iterator[Service]:
     """One for all who leave it as it was: disarmed."""
     running = Service(machine)
     try:
-        running.until(lambda state: bool(state))
+        running.until(lambda _: True)
         yield running
     finally:
         running.end()
@@ -140,7 +152,7 @@ class TestBesideARunningDaemon:
             assert done.returncode == status, done
             assert "Traceback" not in done.stderr
             assert says in done.stderr
-        assert service.until(lambda _: True)["mode"] == "disarmed"
+        assert service.status()["mode"] == "disarmed"
 
     def test_a_stranger_gets_one_line_from_every_command(self, machine: Machine, service: Service) -> None:
         more: dict[str, list[str | Path]] = {
@@ -162,15 +174,15 @@ class TestBesideARunningDaemon:
             done = machine.graderd(STRANGER, *words, *more.get(" ".join(words), []))
             assert done.returncode in (1, 2, 3), (words, done)
             one_line(done)
-        assert service.until(lambda _: True)["mode"] == "disarmed"
+        assert service.status()["mode"] == "disarmed"
 
     def test_calibrating_live(self, machine: Machine, service: Service) -> None:
         """Whoever cannot write the result moves nothing; who can gets the pictures, and they do not stay."""
-        service.until(lambda state: all(r["met"] for r in state["readiness"]) and state["soil"]["frames_per_s"] > 0)
+        service.until(lambda s: all(need.met for need in s.readiness) and s.soil.frames_per_s > 0)
         live = ["calibrate", "camera", "--yes", "--angles-deg", "-15,0,15"]
         for user in (OPERATOR, STRANGER):
             assert machine.graderd(user, *live).returncode == 1
-        state = service.until(lambda _: True)
+        state = service.status()
         assert state["mode"] == "disarmed"
         assert state["axes"]["rotation"]["measured"] == pytest.approx(0.0, abs=0.5)
         own = Path("/home/oper/own.toml")
@@ -184,7 +196,7 @@ class TestBesideARunningDaemon:
         lives(machine)
 
     def test_an_operator_commands_the_machine(self, machine: Machine, service: Service) -> None:
-        service.until(lambda state: all(r["met"] for r in state["readiness"] if r["mandatory"]))
+        service.until(lambda s: all(need.met for need in s.readiness if need.mandatory))
         orders = (["preset"], ["arm"], ["manual"], ["jog", "rotate", "+2deg"], ["stop"], ["reset"])
         for _ in range(3):  # a machine busy with other things may disarm itself between two commands
             refused = [d for words in orders if (d := machine.graderd(OPERATOR, *words)).returncode]
@@ -221,7 +233,7 @@ def test_the_guard_acts_on_what_the_daemon_last_ran_with(machine: Machine) -> No
         machine.must(DAEMON, "sh", "-c", f"until [ -e {folder}/rig.json ]; do sleep 0.1; done")
         service = Service(machine, "--rig-dir", folder)
         try:
-            service.until(lambda state: state["axes"]["rotation"]["measured"] is not None)
+            service.until(lambda s: s.axes["rotation"].measured is not None)
         finally:
             service.end(signal.SIGKILL)
         for spoil in (f"chmod 600 {CONFIG}", f"chown oper:oper {CONFIG}", f"echo [[[ >{CONFIG}", f"rm {CONFIG}"):
@@ -309,9 +321,10 @@ def test_a_socket_elsewhere_is_found(machine: Machine) -> None:
     """By root, as the package asks before an upgrade, and by an operator; both without being told where."""
     elsewhere = "/run/graderd/elsewhere.sock"
     machine.must(ROOT, "sh", "-c", f"printf '[api]\\nsocket = \"{elsewhere}\"\\n' >{CONFIG}")
-    service = Service(machine)
+    service = Service(machine, socket=elsewhere)
     try:
-        assert service.until(lambda _: True, ROOT)["mode"] == "disarmed"
+        service.until(lambda _: True)
+        assert service.status(ROOT)["mode"] == "disarmed"
         assert machine.graderd(OPERATOR, "status").returncode == 0
         assert machine.graderd(STRANGER, "status").returncode == 3
     finally:

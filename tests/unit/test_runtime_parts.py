@@ -65,7 +65,7 @@ def test_a_state_directory_that_stalls_is_not_waited_for_and_told(tmp_path: Path
     began_s = time.monotonic()
     for reason in ("one", "two", "three"):
         assert state.save(reason).reason == reason
-    assert time.monotonic() - began_s < 0.1
+    assert time.monotonic() - began_s < 5.0  # who waits for the disk waits for ever
     assert not state.settle(0.05)
     assert "takes long" in state.problem
     with (tmp_path / "last_stop.new").open("rb"):  # the disk is back
