@@ -137,8 +137,8 @@ def default_socket() -> Path:
     named = os.environ.get("GRADERD_SOCKET")
     if named:
         return Path(named)
-    own = os.environ.get("XDG_RUNTIME_DIR")
-    own_socket = [Path(own) / "graderd" / "graderd.sock"] if own else []
+    own = places.own_socket()
+    own_socket = [] if own is None else [own]
     known = [*_configured_socket(), places.SOCKET, *own_socket]
     for wanted in (_Presence.THERE, _Presence.KEPT_FROM_US):
         for path in known:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import itertools
 import logging
+import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from graderd.cli.console import TAKES_ANYTHING, CliError, ExitCode, Json, example, hand_over, print_json
+from graderd.cli.console import TAKES_ANYTHING, CliError, ExitCode, Json, client_of, example, hand_over, print_json
+from graderd.client import Client
 
 
 class LogLevel(StrEnum):
@@ -34,6 +36,7 @@ def _run(app: typer.Typer) -> None:
 
     @app.command(epilog=example("graderd run --config /etc/graderd/graderd.toml", "graderd run --sim"))
     def run(
+        context: typer.Context,
         config: Annotated[
             Path | None, typer.Option(help="Configuration file. Default: /etc/graderd/graderd.toml if it exists.")
         ] = None,
@@ -48,13 +51,17 @@ def _run(app: typer.Typer) -> None:
     ) -> None:
         """Run the daemon until SIGINT or SIGTERM.
 
-        It starts disarmed. With --json it logs one object a line.
+        It starts disarmed. With --json it logs one object a line. It serves the socket that --socket or $GRADERD_SOCKET
+        names, else the configuration's; where neither names one and /run/graderd is not yours, one of your own, which
+        the other commands find by themselves.
         """
         if sim and rig_dir is not None:
             raise CliError("run", "--sim and --rig-dir exclude each other", "give one of the two", ExitCode.USAGE)
         from graderd.runtime.app import run_daemon
 
-        raise typer.Exit(run_daemon(config, sim, rig_dir, json, logging.getLevelNamesMapping()[log_level.upper()]))
+        level = logging.getLevelNamesMapping()[log_level.upper()]
+        named = context.find_root().obj or os.environ.get("GRADERD_SOCKET") or None
+        raise typer.Exit(run_daemon(config, sim, rig_dir, json, level, Path(named) if named else None))
 
 
 def _guard(app: typer.Typer) -> None:
@@ -101,6 +108,8 @@ def _rig(app: typer.Typer) -> None:
         epilog=example(
             "graderd rig --dir grader --seed 1",
             "graderd rig dataset --out frames --scenes 300 --seed 7",
+            "graderd rig scene left              (lays soil before the blade of a running simulated grader)",
+            "graderd rig drive --distance-m 3",
             "graderd rig -- --help          (all its options)",
         ),
     )
@@ -108,14 +117,24 @@ def _rig(app: typer.Typer) -> None:
         """Run the simulated grader, or write a data set with it.
 
         Soil, blade, camera, virtual servo and virtual actuators in a process of their own, which announces itself in
-        rig.json in its directory (a JSON object). 'dataset' writes a set of labelled frames instead. All further
-        arguments are the rig's own.
+        rig.json in its directory (a JSON object). 'dataset' writes a set of labelled frames instead; 'scene', 'drive'
+        and 'halt' tell the rig of the daemon that runs what to do. All further arguments are the rig's own.
         """
         arguments = context.args
         if arguments[:1] == ["dataset"]:
             hand_over("graderd.simulator.dataset", arguments[1:])
+        elif arguments[:1] and arguments[0] in ("scene", "drive", "halt"):
+            hand_over("graderd.simulator.ask", [_control_of(client_of(context)), *arguments])
         else:
             hand_over("graderd.simulator", arguments)
+
+
+def _control_of(client: Client) -> str:
+    """The control socket of the rig that the daemon runs on."""
+    config = client.config()
+    if not config["simulated"] or config["vehicle"]["source"] != "simulated":
+        raise CliError("rig", "the daemon runs on no simulated grader", "start one: graderd run --sim")
+    return str(config["vehicle"]["path"])
 
 
 def _demo(app: typer.Typer) -> None:

@@ -15,12 +15,17 @@ if TYPE_CHECKING:
 
 
 def run_daemon(
-    config_path: Path | None, sim: bool, rig_dir: Path | None, as_json: bool, log_level: int = logging.INFO
+    config_path: Path | None,
+    sim: bool,
+    rig_dir: Path | None,
+    as_json: bool,
+    log_level: int = logging.INFO,
+    socket: Path | None = None,
 ) -> int:
     """See :func:`graderd.runtime.app.daemon.run_daemon`."""
     from graderd.runtime.app.daemon import run_daemon as run
 
-    return run(config_path, sim, rig_dir, as_json, log_level)
+    return run(config_path, sim, rig_dir, as_json, log_level, socket)
 
 
 def run_guard(config_path: Path | None) -> int:

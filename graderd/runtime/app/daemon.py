@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import logging
+import os
 import shutil
 import signal
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
+from graderd import places
 from graderd.api.app import make_app
 from graderd.api.server import serve
 from graderd.config import Config, ConfigError, load
@@ -41,12 +44,18 @@ log = logging.getLogger("graderd")
 
 
 def run_daemon(
-    config_path: Path | None, sim: bool, rig_dir: Path | None, as_json: bool, log_level: int = logging.INFO
+    config_path: Path | None,
+    sim: bool,
+    rig_dir: Path | None,
+    as_json: bool,
+    log_level: int = logging.INFO,
+    socket: Path | None = None,
 ) -> int:
-    """Run until SIGINT, SIGTERM or SIGHUP. Returns the exit status: 0 after a clean end, 1 where it could not run."""
+    """Run until SIGINT, SIGTERM or SIGHUP. Returns the exit status: 0 after a clean end, 1 where it could not run.
+    ``socket``: where to serve, whatever the configuration says."""
     set_up_logging(as_json, log_level)
     try:
-        config = load(config_path)
+        config = served_at(load(config_path), socket)
         refusals = problems(config)
     except ConfigError as error:
         refusals = error.problems
@@ -62,6 +71,22 @@ def run_daemon(
     for failure in failures:
         log.error("%s", failure)
     return 1 if failures else 0
+
+
+def served_at(config: Config, socket: Path | None) -> Config:
+    """The configuration with the socket that is asked for; where nobody names one and the service's place is not ours,
+    a place of this user's, which the clients know."""
+    own = places.own_socket()
+    service = Path(config.api.socket)
+    if socket is None and own is not None and "socket" not in config.api.model_fields_set:
+        if os.access(service.parent, os.W_OK):
+            return config
+        socket = own
+        with contextlib.suppress(OSError):  # then the socket cannot be made, which says so
+            own.parent.mkdir(mode=0o700, exist_ok=True)
+    if socket is None:
+        return config
+    return config.model_copy(update={"api": config.api.model_copy(update={"socket": str(socket)})})
 
 
 async def _main(config: Config, source: Path | None, sim: bool, rig_dir: Path | None) -> None:

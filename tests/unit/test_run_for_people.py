@@ -1,0 +1,64 @@
+"""`graderd run --sim` by anybody: the daemon serves where the clients look, and `graderd rig` finds its rig."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from graderd import places
+from graderd.client import Client, default_socket
+from graderd.config import Config
+from graderd.runtime.app.daemon import served_at
+
+
+def test_server_and_clients_agree_on_a_place_of_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(places, "SOCKET", tmp_path / "run" / "graderd.sock")
+    monkeypatch.setattr(places, "CONFIG", tmp_path / "none.toml")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("GRADERD_SOCKET", raising=False)
+    unset = type(Config().api).model_construct(
+        _fields_set=set(), **{**dict(Config().api), "socket": str(places.SOCKET)}
+    )
+    config = Config().model_copy(update={"api": unset})
+    served = Path(served_at(config, None).api.socket)
+    assert served == default_socket() == tmp_path / "graderd" / "graderd.sock"
+    assert served.parent.stat().st_mode & 0o777 == 0o700
+    (tmp_path / "run").mkdir()
+    assert Path(served_at(config, None).api.socket) == tmp_path / "run" / "graderd.sock", (
+        "the service's, where it is ours"
+    )
+
+
+def test_a_socket_that_is_named_counts_more_than_any_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert served_at(Config(), tmp_path / "mine.sock").api.socket == str(tmp_path / "mine.sock")
+    named = Config.model_validate({"api": {"socket": "/somewhere/else.sock"}})
+    assert served_at(named, None).api.socket == "/somewhere/else.sock"
+
+
+@pytest.mark.live
+@pytest.mark.whole_machine
+def test_run_sim_without_root_and_configuration_and_soil_laid_by_a_command(tmp_path: Path) -> None:
+    environment = {**os.environ, "GRADERD_SOCKET": str(tmp_path / "my.sock"), "XDG_RUNTIME_DIR": str(tmp_path)}
+    graderd = [sys.executable, "-m", "graderd"]
+    daemon = subprocess.Popen([*graderd, "run", "--sim"], env=environment, stderr=subprocess.DEVNULL)
+    try:
+        client = Client(tmp_path / "my.sock")
+        client.until(lambda status: status.soil.frames_per_s > 0, 60, "pictures")
+        laid = subprocess.run([*graderd, "rig", "scene", "left"], env=environment, check=True, capture_output=True)
+        assert b"ok" in laid.stdout
+        client.until(lambda status: status.soil.zone == "left", 30, "soil is seen left")
+        driven = subprocess.run([*graderd, "rig", "drive", "--distance-m", "0.5"], env=environment, check=True)
+        assert driven.returncode == 0
+        client.until(lambda status: (status.vehicle.travelled_m or 0) > 0.4, 30, "driven")
+        refused = subprocess.run([*graderd, "rig", "scene", "up"], env=environment, capture_output=True, check=False)
+        assert refused.returncode == 2
+    finally:
+        daemon.send_signal(signal.SIGINT)
+        assert daemon.wait(20) == 0
+    assert list(tmp_path.iterdir()) == [], "nothing is left behind"
