@@ -9,11 +9,13 @@ from collections.abc import Sequence
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and exit with its status: 0 done, 1 refused or failed, 2 bad usage, 3 no daemon. Interrupted
-    (Ctrl-C), at whatever moment, it dies by SIGINT, so that a shell ends what it would do next."""
+    """Run the command line and exit with its status: 0 done, 1 refused or failed, 2 bad usage or configuration.
+    Interrupted (Ctrl-C), at whatever moment, it dies by SIGINT, so that a shell ends what it would do next."""
     # Before numpy is imported, here and in every process that is started from here. Its products of matrices are of
     # three columns: threads that wait for such pieces take a processor from the control loop and make nothing quicker.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if sys.stdout is None:  # closed by whoever started us: what is printed is not wanted, and a stop is all the same
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  (for as long as we live)
     try:
         from graderd.cli.app import run_app
 
@@ -22,4 +24,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGINT)
         raise  # not reached
-    sys.exit(status)
+    sys.exit(_all_said(status))
+
+
+def _all_said(status: int) -> int:
+    """The exit status once what was printed has gone out. Where its reader has gone or its disk is full, the
+    interpreter, which would tell of it with a traceback, has nothing left to write."""
+    try:
+        sys.stdout.flush()
+        return status
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            sys.stderr.write(f"graderd: standard output: {error.strerror}. Look at where it goes\n")
+        return status or 1

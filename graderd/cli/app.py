@@ -29,7 +29,7 @@ from graderd.cli import (
     token,
 )
 from graderd.cli.console import CliError, ExitCode, print_error, print_text
-from graderd.client import ClientError, NoDaemonError
+from graderd.client import ClientError
 from graderd.hal.errors import DeviceError
 
 INTERRUPTED = 130
@@ -61,7 +61,7 @@ def make_cli() -> typer.Typer:
     app = typer.Typer(
         name="graderd",
         help="Runs a motor grader's blade by what a camera sees.",
-        epilog="Exit status: 0 done, 1 refused or failed, 2 bad usage, 3 no daemon; "
+        epilog="Exit status: 0 done, 1 refused, failed or nobody there, 2 bad usage or configuration; "
         "after Ctrl-C it ends by SIGINT (130 in a shell), once the blade holds.",
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["--help", "-h"]},
@@ -77,7 +77,11 @@ def make_cli() -> typer.Typer:
                 "/run/graderd/graderd.sock, else $XDG_RUNTIME_DIR/graderd/graderd.sock.",
             ),
         ] = None,
+        version: Annotated[
+            bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
+        ] = False,
     ) -> None:
+        del version
         context.obj = socket
         if context.invoked_subcommand is None:
             print_text(context.get_help())
@@ -102,7 +106,7 @@ def run_app(arguments: list[str]) -> int:
         return error.exit_code
     except ClientError as error:
         print_error(error.where, error.cause, error.remedy, as_json)
-        return ExitCode.NO_DAEMON if isinstance(error, NoDaemonError) else ExitCode.FAILED
+        return ExitCode.FAILED
     except DeviceError as error:
         print_error(error.where, error.cause, error.remedy, as_json)
         return ExitCode.FAILED
@@ -119,13 +123,24 @@ def run_app(arguments: list[str]) -> int:
         return ExitCode.FAILED
     except BrokenPipeError:
         return ExitCode.FAILED
-    except OSError as error:  # a file or directory that this user may not use
-        where = str(error.filename or "graderd")
-        print_error(where, error.strerror or str(error), "Run it as a user who may use it", as_json)
+    except OSError as error:  # a file or directory that this user may not use, or nowhere to print to
+        if error.filename is None:
+            print_error("standard output", error.strerror or str(error), "look at where it goes", as_json=False)
+        else:
+            where = str(error.filename)
+            print_error(where, error.strerror or str(error), "Run it as a user who may use it", as_json)
         return ExitCode.FAILED
     if result == INTERRUPTED:
         raise KeyboardInterrupt
     return result if isinstance(result, int) else ExitCode.OK
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print_text(f"graderd {version('graderd')}")
+        raise typer.Exit
 
 
 def _command(arguments: list[str]) -> str:

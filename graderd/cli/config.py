@@ -250,10 +250,10 @@ def load_or_refuse(file: Path | None, as_json: bool) -> Config:
 def _refuse(problems: list[str], as_json: bool) -> NoReturn:
     if as_json:
         print_json({"valid": False, "problems": problems})
-        raise typer.Exit(ExitCode.FAILED)
+        raise typer.Exit(ExitCode.USAGE)
     for problem in problems[:-1]:
         print_error("", problem, "", as_json=False)
-    raise CliError("", problems[-1])
+    raise CliError("", problems[-1], exit_code=ExitCode.USAGE)
 
 
 def _toml(resolved: dict[str, Any]) -> str:

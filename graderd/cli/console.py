@@ -30,7 +30,6 @@ class ExitCode(IntEnum):
     OK = 0
     FAILED = 1
     USAGE = 2
-    NO_DAEMON = 3
 
 
 class CliError(Exception):

@@ -104,7 +104,8 @@ def cli_page() -> str:
     parts = [
         HEADER + "\n# The command line\n",
         "Source: `graderd/cli/`. `graderd COMMAND --help` prints the same.\n",
-        "Exit status: 0 done, 1 refused or failed, 2 bad usage, 3 no daemon. An error is one line on stderr: "
+        "Exit status: 0 done, 1 refused, failed or nobody there, 2 bad usage or configuration, "
+        "130 interrupted. An error is one line on stderr: "
         "`graderd: WHERE: why. What to do`. With `--json` it is printed on stdout as "
         '`{"error": ..., "where": ..., "remedy": ...}` as well.\n',
         _parameters(root),

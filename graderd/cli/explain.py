@@ -19,7 +19,11 @@ def register(app: typer.Typer) -> None:
     @app.command(epilog=example("graderd explain rotation.no_reply", "graderd explain overload"))
     def explain(
         fault: Annotated[
-            str | None, typer.Argument(help="A fault, a condition or a device; without it, all are listed.")
+            str | None,
+            typer.Argument(
+                help="A fault, a condition or a device; without it, all are listed.",
+                autocompletion=lambda incomplete: [name for name in CATALOGUE if name.startswith(incomplete)],
+            ),
         ] = None,
         json: Json = False,
     ) -> None:

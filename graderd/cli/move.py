@@ -10,11 +10,12 @@ from typing import Annotated, Any
 import typer
 
 from graderd.cli.console import CliError, ExitCode, Json, client_of, example, print_json, print_table, print_text
-from graderd.client import Client
+from graderd.client import Client, ClientError
 from graderd.core.axes import AXES, JOG_AXES, JogName
 
 SETTLED_S = 0.3
 HELD_S = 1.0
+COMPLETION_S = 1.0
 VALUE = re.compile(r"(?P<absolute>=)?(?P<sign>[+-])?(?P<number>\d{1,6}(\.\d{0,9})?|\.\d{1,9})\s*(?P<unit>[^\d\s.]*)")
 
 
@@ -77,7 +78,7 @@ def parse_value(axis: JogName, text: str) -> JogValue:
         CliError: not such a value, or not in the axis's unit.
     """
     unit = JOG_AXES[axis].unit
-    match = VALUE.fullmatch(text.strip())
+    match = VALUE.fullmatch(text.strip().replace("−", "-"))
     if match is None:
         raise CliError(
             f"jog {axis}", f"{text!r} is no value", f"write it like +5{unit}, -5{unit}, 30{unit} or =-30{unit}",
@@ -196,7 +197,17 @@ def _axis_text(axis: dict[str, Any]) -> str:
     if axis["measured"] is None:
         return f"{axis['name']} unknown"
     because = f" ({axis['limited_because']})" if axis["limited_because"] else ""
-    return f"{axis['name']} {axis['measured']:.1f} {axis['unit']}{because}"
+    return f"{axis['name']} {axis['measured']:z.1f} {axis['unit']}{because}"
+
+
+def _poses(context: typer.Context, incomplete: str) -> list[str]:
+    """For the shell's completion: those of the daemon that answers, quickly, or none."""
+    try:
+        named = context.find_root().params.get("socket")
+        names = Client(named, timeout_s=COMPLETION_S).get("/v1/status")["presets"]
+    except ClientError:
+        return []
+    return [name for name in names if name.startswith(incomplete)]
 
 
 def _preset(app: typer.Typer) -> None:
@@ -204,7 +215,10 @@ def _preset(app: typer.Typer) -> None:
     @app.command(epilog=example("graderd preset", "graderd preset transport"))
     def preset(
         context: typer.Context,
-        name: Annotated[str | None, typer.Argument(help="The pose; without it, the poses are listed.")] = None,
+        name: Annotated[
+            str | None,
+            typer.Argument(help="The pose; without it, the poses are listed.", autocompletion=_poses),
+        ] = None,
         timeout_s: Annotated[float, typer.Option(min=0.1, help="Fail if it has not arrived by then.")] = 120.0,
         json: Json = False,
     ) -> None:

