@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -35,6 +36,25 @@ Three paths are WebSockets: `/v1/stream`, `/v1/jog` and `/v1/bus/{name}`. Messag
 """
 
 
+EVERYWHERE = {
+    "400": "no HTTP at all",
+    "401": "TCP: no token, or not the right one",
+    "403": "TCP: a foreign Host or Origin, or a token that may only read",
+    "404": "there is no such path, or nothing there now",
+    "405": "not this method",
+    "408": "the body took too long",
+    "413": "the body is too large",
+    "422": "malformed; the machine is as it was",
+    "431": "the head of the request is too long",
+    "503": "too many requests; stop is served all the same",
+}
+"""What any request may be answered with, beside what its route says of itself."""
+SECURITY = {
+    "bearer": {"type": "http", "scheme": "bearer", "description": "a token that 'graderd token create' made (TCP)"},
+    "cookie": {"type": "apiKey", "in": "cookie", "name": "graderd_token", "description": "set by POST /v1/session"},
+}
+
+
 def make_app(port: DaemonPort, limits: ApiLimits | None = None) -> FastAPI:
     """The application. ``app.state.closing`` is its :class:`Closing`; whoever serves it tells it when to end.
     ``app.state.stops`` carries out stops, ``app.state.stop_socket`` those of the socket that serves nothing else."""
@@ -61,7 +81,28 @@ def make_app(port: DaemonPort, limits: ApiLimits | None = None) -> FastAPI:
     app.add_middleware(Limiter, limits=limits, closing=app.state.closing)
     for kind, handler in _handlers().items():
         app.add_exception_handler(kind, handler)
+    described = app.openapi
+    app.openapi = lambda: _completed(described())  # type: ignore[method-assign]
     return app
+
+
+def _completed(description: dict[str, Any]) -> dict[str, Any]:
+    """The description with what holds for every request: who may ask, and what anybody may be answered."""
+    if "securitySchemes" in description["components"]:
+        return description
+    description["components"]["securitySchemes"] = SECURITY
+    problem = {"application/json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    for operations in description["paths"].values():
+        for operation in operations.values():
+            operation["security"] = [{name: []} for name in SECURITY]
+            for status_code, text in EVERYWHERE.items():
+                if status_code == "422":
+                    # FastAPI describes a form of its own, which nobody is ever answered with.
+                    operation["responses"].pop("422", None)
+                operation["responses"].setdefault(status_code, {"description": text, "content": problem})
+    for unused in ("HTTPValidationError", "ValidationError"):
+        description["components"]["schemas"].pop(unused, None)
+    return description
 
 
 def _handlers() -> dict[type[Exception], Callable[[Request, Exception], Awaitable[JSONResponse]]]:

@@ -400,7 +400,7 @@ def test_config_check_asks_the_driver_too(tmp_path: Path) -> None:
     told = subprocess.run(
         [sys.executable, "-m", "graderd", "config", "check", str(path)], capture_output=True, text=True
     )
-    assert told.returncode == 1
+    assert told.returncode == 2
     assert "Did you mean rotation.driver.address_n?" in told.stderr
 
 

@@ -283,7 +283,13 @@ async def test_the_description_is_complete(tmp_path: Path) -> None:
     assert "RotationStepResponseRequest" in json.dumps(step)
     assert {name: one["type"] for name, one in arguments.items()} == {"step_deg": "number", "consent": "boolean"}
     assert {"409", "422", "503", "504"} <= set(paths["/v1/commands"]["post"]["responses"])
+    for operations in paths.values():
+        for operation in operations.values():
+            assert {"401", "403", "404", "405", "408", "413", "422", "431", "503"} <= set(operation["responses"])
+            assert operation["security"] == [{"bearer": []}, {"cookie": []}]
+    assert set(description["components"]["securitySchemes"]) == {"bearer", "cookie"}
     text = json.dumps(description, allow_nan=False)
+    assert "HTTPValidationError" not in text
     schemas = set(re.findall(r'"#/components/schemas/(\w+)"', text))
     assert schemas <= set(description["components"]["schemas"])
     assert {"Status", "Reply", "Problem", "AxisStatus", "FaultStatus"} <= schemas

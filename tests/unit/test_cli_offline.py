@@ -90,7 +90,7 @@ def test_check_refuses_what_run_refuses_and_run_before_anything_starts(
 ) -> None:
     path = tmp_path / "graderd.toml"
     path.write_text(text)
-    assert run_app(["config", "check", str(path)]) == 1
+    assert run_app(["config", "check", str(path)]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert says in said
@@ -107,15 +107,15 @@ def test_config_check_tells_each_mistake_in_a_line(tmp_path: Path, capsys: Captu
     bad.write_text('[rotation]\nmax_dg = 45.0\n[machine]\nlease_s = "soon"\n')
     assert run_app(["config", "check", str(good)]) == 0
     assert "valid" in capsys.readouterr().out
-    assert run_app(["config", "check", str(bad)]) == 1
+    assert run_app(["config", "check", str(bad)]) == 2
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err.count("\n") == 2
     assert "Did you mean rotation.max_deg?" in said.err
     assert all(line.startswith("graderd: ") for line in said.err.splitlines())
-    assert run_app(["config", "check", str(bad), "--json"]) == 1
+    assert run_app(["config", "check", str(bad), "--json"]) == 2
     assert len(json.loads(capsys.readouterr().out)["problems"]) == 2
-    assert run_app(["config", "check", str(tmp_path / "none.toml")]) == 1
+    assert run_app(["config", "check", str(tmp_path / "none.toml")]) == 2
     assert "none.toml" in capsys.readouterr().err
 
 
@@ -183,14 +183,15 @@ def test_run_and_guard_give_the_daemons_exit_status(monkeypatch: pytest.MonkeyPa
 
         return called
 
+    monkeypatch.delenv("GRADERD_SOCKET", raising=False)
     monkeypatch.setattr("graderd.runtime.app.run_daemon", fake("daemon", 1))
     monkeypatch.setattr("graderd.runtime.app.run_guard", fake("guard", 1))
     assert run_app(["run", "--config", "c.toml", "--rig-dir", "r", "--json"]) == 1
     assert run_app(["run", "--sim", "--log-level", "error"]) == 1
     assert run_app(["guard", "--config", "c.toml", "--json"]) == 1
     assert calls == [
-        ("daemon", Path("c.toml"), False, Path("r"), True, logging.INFO),
-        ("daemon", None, True, None, False, logging.ERROR),
+        ("daemon", Path("c.toml"), False, Path("r"), True, logging.INFO, None),
+        ("daemon", None, True, None, False, logging.ERROR, None),
         ("guard", Path("c.toml")),
     ]
     assert json.loads(capsys.readouterr().out) == {"safe": False}

@@ -67,7 +67,7 @@ def test_what_would_not_run_is_not_written(
     path = tmp_path / "graderd.toml"
     path.write_text("# mine\n")
     status, told = asked(capsys, "set", key, value, "--config", str(path))
-    assert status == 1
+    assert status == 2
     assert says in " ".join(told["problems"])
     assert path.read_text() == "# mine\n"
     assert [found.name for found in tmp_path.iterdir() if found.name.endswith(".bak")] == []
@@ -86,7 +86,7 @@ def test_a_certificate_that_is_not_there_is_found_before_the_start(
     path = tmp_path / "graderd.toml"
     path.write_text(f'[api.tcp]\ncertificate_file = "{tmp_path}/none.pem"\nkey_file = "{tmp_path}/none.key"\n')
     status, told = asked(capsys, "check", str(path))
-    assert status == 1
+    assert status == 2
     assert "none.key" in told["problems"][0]
 
 
