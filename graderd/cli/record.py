@@ -255,15 +255,22 @@ def _store(context: typer.Context, config: Path | None, folder: Path | None) -> 
 
 
 def settings_of(context: typer.Context, path: Path | None) -> Config:
-    """The file's, else the running daemon's, else the installed one's."""
-    from graderd.config import Config, load
+    """The file's, else the running daemon's, else the installed one's.
+
+    Raises:
+        CliError: the file cannot be read, or is not valid.
+    """
+    from graderd.config import Config, ConfigError, load
 
     if path is None:
         try:
             return Config.model_validate(client_of(context).config())
         except NoDaemonError:
             pass
-    return load(path)
+    try:
+        return load(path)
+    except ConfigError as error:
+        raise CliError("", error.problems[0], "", ExitCode.USAGE) from None
 
 
 def path_of(context: typer.Context, file: Path, config: Path | None) -> Path:
