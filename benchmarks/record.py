@@ -22,7 +22,7 @@ from graderd.record.store import Store
 from harness.recording import Feed, record_until_killed
 
 WINDOW_S = 10.0
-BESIDE_N = 4
+BESIDE_N = 2
 
 
 def cpu_s() -> float:

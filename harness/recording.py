@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import signal
 import subprocess
 import sys
 import time
@@ -84,10 +83,12 @@ def record_until_killed(folder: Path, after_s: float) -> float:
     command = [sys.executable, "-m", "harness.recording", str(folder)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
-        first_s = last_s = float(process.stdout.readline())
-        while last_s - first_s < after_s:
-            last_s = float(process.stdout.readline())
-        process.send_signal(signal.SIGKILL)
+        try:
+            first_s = last_s = float(process.stdout.readline())
+            while last_s - first_s < after_s:
+                last_s = float(process.stdout.readline())
+        finally:
+            process.kill()
         ticked = process.stdout.read().split(b"\n")[:-1]  # what came after its last line end is no whole line
     last_s = float(ticked[-1]) if ticked else last_s
     (path,) = folder.glob("*.mcap")

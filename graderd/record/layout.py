@@ -15,7 +15,7 @@ import json
 import pickle
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, get_type_hints
 
@@ -408,6 +408,7 @@ _FOXGLOVE: Final = {
 }
 
 
+@cache
 def schema_of(topic: str) -> tuple[str, bytes]:
     """Name and JSON Schema of a channel's messages."""
     if topic in _FOXGLOVE:

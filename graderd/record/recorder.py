@@ -53,6 +53,7 @@ from graderd.record.layout import (
     image_message,
     log_message,
     memory_of,
+    schema_of,
     sensed_bytes,
     tick_bytes,
     transform_message,
@@ -243,6 +244,8 @@ class _Files:
         self.incidents = IncidentWatch()
         self.now_s = 0.0
         self._config_json = config.model_dump_json().encode()
+        for topic in (SENSED, TICK, MEMORY):  # made once, now: it would hold up ticks later
+            schema_of(topic)
         self._head = head_of(config)
         self._ring = Ring()
         self._translator = Translator()
