@@ -10,6 +10,7 @@ stepped wall clock does not make a recording jump.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import pickle
@@ -22,11 +23,26 @@ from typing import Any, Final, Literal, NamedTuple, get_type_hints
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 from typing_extensions import TypedDict
 
+from graderd.core import (
+    attitude,
+    axes,
+    commands,
+    gate,
+    lift_pair,
+    machine,
+    plausibility,
+    readiness,
+    rule,
+    soil,
+    tick,
+)
 from graderd.core.axes import AXES
+from graderd.core.faults import monitor
 from graderd.core.faults.monitor import ActiveFault, FaultRow
 from graderd.core.readiness import Requirement
 from graderd.core.soil import SoilObservation
 from graderd.core.tick import AxisTick, Controller, Sensed, Tick, TickSettings
+from graderd.hal import fault, reading
 from graderd.hal.camera import Intrinsics
 
 SENSED: Final = "/sensed"
@@ -242,6 +258,7 @@ def frame_of(data: bytes) -> FrameRecord:
 def memory_of(controller: Controller, settings: TickSettings) -> bytes:
     """Everything the controller keeps in mind, without the settings it goes by."""
     out = io.BytesIO()
+    out.write(_fingerprint())
     _MemoryWriter(out, settings).dump(controller)
     return out.getvalue()
 
@@ -252,13 +269,35 @@ def controller_of(memory: bytes, settings: TickSettings) -> Controller:
     Raises:
         ValueError: nothing that today's tick could go on from: another version's, or no memory at all.
     """
+    mark = _fingerprint()
+    if not memory.startswith(mark):
+        raise ValueError("the tick's memory is of another version of the tick")
     try:
-        found = _MemoryReader(io.BytesIO(memory), settings).load()
+        found = _MemoryReader(io.BytesIO(memory[len(mark) :]), settings).load()
     except Exception as error:  # whatever a damaged or foreign pickle leads to
         raise ValueError(f"the tick's memory cannot be read ({error})") from error
     if not isinstance(found, Controller) or _shape(found) != _shape(Controller(settings)):
         raise ValueError("the tick's memory is of another version of the tick")
     return found
+
+
+_KEPT_IN_MEMORY: Final = (
+    attitude, axes, commands, gate, lift_pair, machine, monitor, plausibility, readiness, rule, soil, tick, fault,
+    reading,
+)  # fmt: skip
+"""Where the classes are whose values a controller keeps."""
+
+
+@cache
+def _fingerprint() -> bytes:
+    """Of the fields of those classes: they are kept by their place, so a memory with others is none."""
+    fields_of = {
+        f"{module.__name__}.{name}": [*getattr(kind, "__dataclass_fields__", getattr(kind, "_fields", ()))]
+        for module in _KEPT_IN_MEMORY
+        for name, kind in vars(module).items()
+        if isinstance(kind, type)
+    }
+    return hashlib.sha256(json.dumps(fields_of, sort_keys=True).encode()).hexdigest()[:16].encode()
 
 
 def _parts_of(settings: TickSettings) -> dict[str, Any]:

@@ -21,6 +21,7 @@ import pytest
 from mcap.reader import make_reader
 
 from graderd.config import Config, parse
+from graderd.core import rule as rule_module
 from graderd.core.attitude import MeasuredAttitude
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import ActiveFault
@@ -29,6 +30,7 @@ from graderd.core.soil import SoilObservation, Zone
 from graderd.core.tick import Controller, Sensed, Tick
 from graderd.hal.camera import Frame, Intrinsics
 from graderd.hal.reading import Reading
+from graderd.record import layout
 from graderd.record import recorder as recorder_module
 from graderd.record.export import export, raw_frames
 from graderd.record.files import RecordingFile
@@ -149,7 +151,18 @@ class Renamed:
 )
 def test_a_memory_that_is_none_is_refused_and_runs_nothing(memory: bytes) -> None:
     with pytest.raises(ValueError, match="the tick's memory"):
+        controller_of(layout._fingerprint() + memory, SETTINGS)
+
+
+def test_a_memory_of_a_class_with_other_fields_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = memory_of(Controller(SETTINGS), SETTINGS)
+    layout._fingerprint.cache_clear()
+    monkeypatch.setattr(rule_module, "Later", SoilObservation, raising=False)
+    with pytest.raises(ValueError, match="another version"):
         controller_of(memory, SETTINGS)
+    monkeypatch.undo()
+    layout._fingerprint.cache_clear()
+    controller_of(memory, SETTINGS)
 
 
 def test_a_memory_of_another_version_is_refused() -> None:
