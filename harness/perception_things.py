@@ -1,4 +1,4 @@
-"""Pictures of things that are no soil: legs, foliage and a pipe before the rig's blade."""
+"""Pictures of things that are no soil: legs, foliage, a pipe, boxes and a stone before the rig's blade."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from graderd.simulator.grader.piles import SceneZone, lay_scene
 from graderd.simulator.grader.soil import SoilField
 
 VEHICLE_X_M = 3.0
-KINDS = ("legs", "foliage", "pipe")
+KINDS = ("legs", "foliage", "pipe", "box", "crate", "stone")
 SIDES = {Zone.LEFT: 1.0, Zone.CENTER: 0.0, Zone.RIGHT: -1.0}
 DEPTH_SIZE, COLOR_SIZE = (848, 480), (320, 200)
 
@@ -37,6 +37,12 @@ def things(kind: str, s_m: float, d_m: float, angle_deg: float, rng: np.random.G
         return tuple(solids)
     if kind == "pipe":
         return (Solid("box", at(s_m, d_m, 0.05), (0.05, 0.225, 0.05), (90, 80, 60), azimuth),)
+    if kind == "box":
+        return (Solid("box", at(s_m, d_m, 0.05), (0.10, 0.10, 0.05), (90, 80, 70), azimuth),)
+    if kind == "crate":
+        return (Solid("box", at(s_m, d_m, 0.10), (0.15, 0.15, 0.10), (90, 80, 70), azimuth),)
+    if kind == "stone":
+        return (Solid("ellipsoid", at(s_m, d_m, 0.05), (0.12, 0.15, 0.08), (120, 120, 120), azimuth),)
     leaves = []
     for _ in range(70):
         s, d = s_m + float(rng.normal(0, 0.08)), d_m + float(rng.normal(0, 0.06))

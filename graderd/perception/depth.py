@@ -320,7 +320,8 @@ class DepthJudge:
         slope = np.tan(np.radians((form.steepest_deg, settings.repose_deg))) * self._cell_d_m
         spread, hanging = steep_cells(square.reshape(shape), count.reshape(shape), noise_m, form)
         high = above_neighbours(height, seen & ~hanging, float(slope[0]))
-        seen &= ~hanging & (high < HANGS_M)
+        above = seen & ~hanging & (high >= HANGS_M)
+        seen &= ~hanging & ~above
         steep = seen & (spread | (high > STEEP_TOLERANCE_M))
         good = seen & ~steep
         # What touches the face hides in the face's own margin: soil goes on to it as high as it is just before.
@@ -328,7 +329,7 @@ class DepthJudge:
         height[touching, 0], good[touching, 0] = height[touching, 1], True
         filled = fill_hidden(height, good, float(slope[1]), float(slope[0]))
         threshold = max(settings.min_height_m, settings.noise_factor_ratio * ground.residual_m)
-        forms = sort_out(height, filled, seen, steep, ground.residual_m, threshold, form)
+        forms = sort_out(height, filled, seen, steep, above, ground.residual_m, threshold, form)
         volumes_l, carried_l, ahead_l = self._split(filled, forms.soil, angle_deg + fix.turn_deg)
         doubtful_l, doubtful_ahead_l = NOTHING, NOTHING
         if forms.doubtful[self._before].any():

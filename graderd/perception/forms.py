@@ -59,6 +59,9 @@ TALL_M = 0.03
 """Cells lower than this say nothing about form: their steepness drowns in noise."""
 FOOT_CELLS_N = 3
 """A heap's foot runs out below the level at which lumps are told apart: so many cells more count."""
+CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+ENDS_LEAST_N = 6
+"""Where fewer cells show how a lump ends, as between the blade's face and a heap, nothing is said by it."""
 BESIDE_CELLS_N = 2
 """Cells so near to a steep one are not clear of it."""
 
@@ -75,11 +78,13 @@ class Forms:
 
 
 def sort_out(
-    height: F64, filled: F64, seen: Bools, steep: Bools, residual_m: float, stands_out_m: float, settings: FormSettings
-) -> Forms:
+    height: F64, filled: F64, seen: Bools, steep: Bools, above: Bools,
+    residual_m: float, stands_out_m: float, settings: FormSettings,
+) -> Forms:  # fmt: skip
     """Sort a height map into soil, things and ground.
 
-    ``height`` of the ``seen`` cells, ``filled``: the same without the steep cells, and with what is hidden guessed.
+    ``height`` of the ``seen`` cells and of those that are far ``above`` their neighbours, ``filled``: of the seen ones
+    without the steep cells, and with what is hidden guessed.
     ``stands_out_m``: what soil must rise above the ground somewhere.
     """
     surface = np.where(seen, height, filled)
@@ -94,6 +99,12 @@ def sort_out(
     steep_n = np.bincount(flat, weights=(tall & steep).ravel(), minlength=count)
     core = np.divide(core_n, tall_n, out=np.ones(count), where=tall_n > 0)
     is_thing = (core * 100.0 < settings.thing_core_percent) & (steep_n > 0)
+    # Soil runs out into the ground, wherever that is seen beside it. A box or a slab ends all round in a step.
+    ends = tall & (cv2.dilate((seen & ~tall).astype(np.uint8), CROSS) > 0)
+    rim = above & (height < cv2.dilate(np.where(tall, height, 0.0), CROSS) + LEVEL_M)  # what hangs over it is higher
+    ends_n = np.bincount(flat, weights=(ends | rim).ravel(), minlength=count)
+    steps_n = np.bincount(flat, weights=((ends & steep) | rim).ravel(), minlength=count)
+    is_thing |= (ends_n >= ENDS_LEAST_N) & (steps_n * 100.0 > settings.thing_steps_percent * ends_n)
     high = cv2.blur(filled, (3, 3)) > stands_out_m
     is_thing[0] = False
     stands = (np.bincount(flat, weights=high.ravel(), minlength=count) > 0) & ~is_thing

@@ -131,6 +131,9 @@ class FormSettings(Settings):
     thing_core_percent: Percent = Field(
         default=20.0, description="a lump with less than this clear of steep cells is no soil"
     )
+    thing_steps_percent: Percent = Field(
+        default=40.0, description="a lump that ends in steps on more than this of its seen border is no soil"
+    )
     thing_largest_l: Positive = Field(
         default=7.0,
         description="more than this without the form of soil is soil seen badly, or a heap of things: unknown",

@@ -1,4 +1,4 @@
-"""What is no soil by its form: legs, foliage and pipes on empty and loaded beds."""
+"""What is no soil by its form: legs, foliage, pipes, boxes and stones on empty and loaded beds."""
 
 from __future__ import annotations
 
@@ -51,14 +51,15 @@ def test_legs_are_obstructed_on_a_bare_bed_and_never_soil(side: Zone, loaded: Sc
             assert str(side) in observation.faults[0].detail
 
 
-@pytest.mark.parametrize("kind", ["foliage", "pipe"])
+@pytest.mark.parametrize("kind", ["foliage", "pipe", "box", "crate", "stone"])
 @pytest.mark.parametrize("side", [Zone.LEFT, Zone.RIGHT])
 def test_what_lies_there_and_is_no_soil_does_not_count(kind: str, side: Zone) -> None:
-    empty = photograph(renderer(), kind, side, SceneZone.NONE, 15.0, 2)
-    assert judged(empty, 15.0).zone in (Zone.NONE, Zone.UNKNOWN)
     opposite = SceneZone.RIGHT if side is Zone.LEFT else SceneZone.LEFT
-    loaded = photograph(renderer(), kind, side, opposite, 15.0, 2)
-    assert judged(loaded, 15.0).zone in (Zone(str(opposite)), Zone.UNKNOWN)
+    for number, angle_deg in ((2, 15.0), (3, -30.0)):
+        empty = photograph(renderer(), kind, side, SceneZone.NONE, angle_deg, number)
+        assert judged(empty, angle_deg).zone in (Zone.NONE, Zone.UNKNOWN)
+        loaded = photograph(renderer(), kind, side, opposite, angle_deg, number)
+        assert judged(loaded, angle_deg).zone in (Zone(str(opposite)), Zone.UNKNOWN)
 
 
 def test_a_colour_method_sees_who_stands_there_too() -> None:
