@@ -21,6 +21,8 @@ READY_S = 60.0
 CONFIG = """\
 [api]
 socket = "{socket}"
+"""
+PICTURES = """\
 [camera]
 rate_hz = 6.0
 color_width_px = 320
@@ -102,10 +104,11 @@ async def start_rig(directory: Path) -> asyncio.subprocess.Process:
 
 @asynccontextmanager
 async def machine(directory: Path, more_config: str = "") -> AsyncIterator[Machine]:
-    """Start both, give the machine, end both whatever happened. ``more_config`` is further TOML."""
+    """Start both, give the machine, end both whatever happened. ``more_config``: further TOML, of the camera too."""
     rig = await start_rig(directory)
     socket_path = directory / "graderd.sock"
-    (directory / "graderd.toml").write_text(CONFIG.format(socket=socket_path) + more_config, encoding="utf-8")
+    config = CONFIG.format(socket=socket_path) + ("" if "[camera]" in more_config else PICTURES) + more_config
+    (directory / "graderd.toml").write_text(config, encoding="utf-8")
     daemon = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "graderd", "run"),
         *("--config", str(directory / "graderd.toml"), "--rig-dir", str(directory)),
@@ -125,7 +128,8 @@ async def machine(directory: Path, more_config: str = "") -> AsyncIterator[Machi
 def standing_machine(directory: Path) -> Iterator[Served]:
     """A patient one for several tests, each with an event loop of its own, which leave it armed or not, but alive."""
     socket_path = directory / "graderd.sock"
-    (directory / "graderd.toml").write_text(CONFIG.format(socket=socket_path) + PATIENT, encoding="utf-8")
+    config = CONFIG.format(socket=socket_path) + PICTURES + PATIENT
+    (directory / "graderd.toml").write_text(config, encoding="utf-8")
     words = ("run", "--config", str(directory / "graderd.toml"), "--rig-dir", str(directory))
     with running_rig(directory), subprocess.Popen([sys.executable, "-m", "graderd", *words]) as daemon:
         try:
