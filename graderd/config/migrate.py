@@ -98,7 +98,11 @@ _MERGED: Final[Mapping[str, tuple[Callable[[list[float]], float], _Sources]]] = 
         )
     },
 }
-_GONE_IN_2: Final = frozenset(old for _, sources in _MERGED.values() for old, _ in sources) - set(_MERGED)
+_DROPPED: Final[Mapping[str, str]] = {"recording.rate_hz": "every tick is recorded"}
+"""What version 2 has no more use for, and why."""
+_GONE_IN_2: Final = frozenset(old for _, sources in _MERGED.values() for old, _ in sources) - set(_MERGED) | set(
+    _DROPPED
+)
 
 
 def _to_2(document: Document) -> list[str]:
@@ -114,6 +118,7 @@ def _to_2(document: Document) -> list[str]:
             _set(document, new, value)
         if set(given) != {new} or given[new] != value:
             changes.append(f"{' and '.join(given)}: now {new} = {value:g}")
+    changes += [f"{old} is gone: {why}" for old, why in _DROPPED.items() if _get(document, old) is not None]
     for old in sorted(_GONE_IN_2):
         _drop(document, old)
     return changes

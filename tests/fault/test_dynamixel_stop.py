@@ -102,7 +102,7 @@ async def test_on_a_clean_line(rig: Bench) -> None:
     assert rig.rotator.lifecycle is Lifecycle.ACTIVE
 
 
-@pytest.mark.serial_only  # who withholds the processor for a moment adds to what the line loses
+@pytest.mark.whole_machine  # who withholds the processor for a moment adds to what the line loses
 async def test_with_15_percent_of_the_exchanges_lost(rig: Bench) -> None:
     """Of twelve stops, some lose the hold, some the reading before it, some both."""
     await rig.rotator.arm()

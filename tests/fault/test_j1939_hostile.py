@@ -42,9 +42,14 @@ class Monitor:
         machine.link._factory = lambda: self._watched(factory())
 
     def drive(self, axis: ElectrakActuator, target_mm: float) -> None:
-        """What the gate passes."""
-        axis.set_target_mm(target_mm)
+        """What the gate passes; what cannot wait is on the bus before the call returns."""
+        former = self._passed.get(axis.address)
         self._passed[axis.address] = (target_mm, self._machine.clock.now_s())
+        try:
+            axis.set_target_mm(target_mm)
+        except DeviceError:
+            self._passed[axis.address] = former
+            raise
 
     def end(self, axis: ElectrakActuator) -> None:
         """A stop."""

@@ -136,4 +136,8 @@ actuator_tolerance_mm = 2.0
 def test_a_limit_that_the_gates_default_narrowed_stays_narrow() -> None:
     text, _ = migrate_text("version = 1\n[rotation]\nmin_deg = -80.0\n")
     assert parse(tomllib.loads(text)).figures()["rotation"].low == -60.0
+    text, changes = migrate_text("[recording]\nrate_hz = 10.0\nmax_mb = 100.0\n")
+    assert "rate_hz" not in text
+    assert "max_mb = 100.0" in text
+    assert changes == ["recording.rate_hz is gone: every tick is recorded"]
     assert migrate_text("[rotation]\nmin_deg = -80.0\n") == ("[rotation]\nmin_deg = -80.0\n", [])
