@@ -17,7 +17,7 @@ from graderd.core import commands as cmd
 from graderd.core.attitude import MeasuredAttitude
 from graderd.core.axes import ACTUATORS
 from graderd.core.machine import Mode
-from graderd.core.soil import SoilObservation, Zone
+from graderd.core.soil import OPPOSITE, SoilObservation, Zone
 from graderd.core.tick import AxisSensed, Controller, Sensed, Tick, TickSettings
 from graderd.hal.camera import Frame
 from graderd.hal.device import Lifecycle
@@ -41,7 +41,6 @@ SETTLED_DEG = 0.7
 UNDECIDED_S = 4.0
 """No decision for so long: the machine drives all the same."""
 FIXED_DEG = 15.0
-OPPOSITE = {"left": "right", "right": "left"}
 
 ON_GROUND = MeasuredAttitude(2.0, 0.0, 0.0)
 """What the lifts and the tilt measure while the edge drags."""
@@ -80,7 +79,7 @@ class Outcome:
     @property
     def wrong_side(self) -> bool:
         """Whether any decision turned the blade to the other side of the soil."""
-        return OPPOSITE.get(self.case.zone) in self.decisions
+        return OPPOSITE.get(Zone(self.case.zone)) in self.decisions
 
 
 class Decisions:

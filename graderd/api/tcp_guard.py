@@ -66,9 +66,9 @@ class Tokens:
         """Take changes of the file until cancelled."""
         while True:
             await asyncio.sleep(TOKENS_CHECK_S)
-            self.look()
+            self.reload()
 
-    def look(self) -> None:
+    def reload(self) -> None:
         """Take what has changed since."""
         stamp = _stamp(self._path)
         if stamp == self._seen:

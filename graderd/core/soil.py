@@ -32,6 +32,10 @@ class Zone(StrEnum):
     UNKNOWN = "unknown"
 
 
+OPPOSITE = {Zone.LEFT: Zone.RIGHT, Zone.RIGHT: Zone.LEFT}
+"""The side that a side must never be taken for."""
+
+
 @dataclass(frozen=True, slots=True)
 class PictureFault:
     """Something wrong with the picture: ``condition`` is a row of the fault catalogue's ``camera`` part."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from graderd.core.soil import Zone
+from graderd.core.soil import OPPOSITE, Zone
 from graderd.perception.geometry import CENTER, LEFT, RIGHT
 from graderd.perception.settings import DecisionSettings
 
@@ -74,7 +74,6 @@ def decide(
     return Verdict(name, confidence, f"{numbers}: most of it {name}", shares, volumes_l)
 
 
-OPPOSITE = {Zone.LEFT: Zone.RIGHT, Zone.RIGHT: Zone.LEFT}
 SURE_COLOR = 0.8
 """Confidence from which a colour verdict counts as an objection."""
 

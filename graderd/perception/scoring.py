@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from graderd.core.soil import ColorMethod, SoilObservation, Zone
+from graderd.core.soil import OPPOSITE, ColorMethod, SoilObservation, Zone
 from graderd.perception.settings import LABELS, PerceptionSettings, SiteFigure
 
 PILES = (Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN)
-OPPOSITE = {Zone.LEFT: Zone.RIGHT, Zone.RIGHT: Zone.LEFT}
 
 
 @dataclass

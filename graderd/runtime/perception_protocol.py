@@ -54,7 +54,7 @@ class Angle(_Message):
         return MeasuredAttitude(self.height_mm, self.slope_deg, self.pitch_deg)
 
 
-class Look(_Message):
+class PreviewFormat(_Message):
     """How a picture is wanted. ``labels``: with names and numbers in it, else lines alone, for whoever writes them
     beside it and may mirror it. ``width_px``: no wider than that; None: as the camera gives it."""
 
@@ -66,7 +66,7 @@ class PreviewRequest(_Message):
     """Send the next frame's annotated picture."""
 
     kind: Literal["preview"] = "preview"
-    look: Look = Look()
+    format: PreviewFormat = PreviewFormat()
 
 
 class SaveFrame(_Message):
@@ -147,7 +147,7 @@ class Preview(_Message):
     """An annotated picture, JPEG, base64; ``capture_s``: monotonic, when it was taken."""
 
     kind: Literal["preview"] = "preview"
-    look: Look
+    format: PreviewFormat
     capture_s: float
     jpeg_base64: str
 

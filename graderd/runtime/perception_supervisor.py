@@ -33,10 +33,10 @@ from graderd.runtime.perception_protocol import (
     Angle,
     CameraProblem,
     FromChild,
-    Look,
     Observed,
     Opened,
     Preview,
+    PreviewFormat,
     PreviewRequest,
     RecordFrames,
     Saved,
@@ -62,7 +62,7 @@ MAX_UNSENT_BYTES = 64 * 1024
 log = logging.getLogger(__name__)
 _FIELDS = {"device": "camera"}
 
-AS_IT_IS = Look()
+AS_IT_IS = PreviewFormat()
 
 
 class PerceptionSupervisor:
@@ -100,7 +100,7 @@ class PerceptionSupervisor:
         self._opens_without_frame_n = 0
         self._restarts_n = 0
         self._frame_times: deque[float] = deque(maxlen=30)
-        self._previews: dict[Look, asyncio.Future[Reading[bytes]]] = {}
+        self._previews: dict[PreviewFormat, asyncio.Future[Reading[bytes]]] = {}
         self._saved: asyncio.Future[Saved] | None = None
         self._frames = FramesWanted()
 
@@ -173,16 +173,16 @@ class PerceptionSupervisor:
         """Tell the child the measured blade angle and attitude; dropped while the child does not read."""
         self._write(Angle(angle_deg=angle_deg, time_s=time_s, **asdict(attitude)))
 
-    async def preview_jpeg(self, look: Look = AS_IT_IS, timeout_s: float = 3.0) -> Reading[bytes]:
-        """The next frame's annotated picture, and when it was taken; who asks for the same look gets the same.
+    async def preview_jpeg(self, wanted: PreviewFormat = AS_IT_IS, timeout_s: float = 3.0) -> Reading[bytes]:
+        """The next frame's annotated picture, and when it was taken; who asks for the same gets the same.
 
         Raises:
             TimeoutError: none came.
         """
-        preview = self._previews.get(look)
+        preview = self._previews.get(wanted)
         if preview is None or preview.done():
-            preview = self._previews[look] = asyncio.get_running_loop().create_future()
-            self._write(PreviewRequest(look=look))
+            preview = self._previews[wanted] = asyncio.get_running_loop().create_future()
+            self._write(PreviewRequest(format=wanted))
         async with asyncio.timeout(timeout_s):
             return await asyncio.shield(preview)
 
@@ -320,7 +320,7 @@ class PerceptionSupervisor:
             if self._saved is not None and not self._saved.done():
                 self._saved.set_result(message)
         else:
-            preview = self._previews.pop(message.look, None)
+            preview = self._previews.pop(message.format, None)
             if preview is not None and not preview.done():
                 preview.set_result(Reading(base64.b64decode(message.jpeg_base64), message.capture_s))
         return True

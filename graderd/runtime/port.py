@@ -18,7 +18,7 @@ from graderd.hal.device import DeviceService, WatchBus
 from graderd.hal.errors import DeviceError
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import Devices
-from graderd.runtime.perception_protocol import Look
+from graderd.runtime.perception_protocol import PreviewFormat
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 from graderd.runtime.status import build_status
 
@@ -89,7 +89,7 @@ class Port:
     async def preview_jpeg(self, *, labels: bool = True, width_px: int | None = None) -> tuple[bytes, float]:
         """The newest annotated picture, and its age in seconds."""
         try:
-            picture = await self._eyes.preview_jpeg(Look(labels=labels, width_px=width_px))
+            picture = await self._eyes.preview_jpeg(PreviewFormat(labels=labels, width_px=width_px))
         except TimeoutError:
             raise ServiceError("the camera gives no picture", "see graderd status for its fault") from None
         return picture.value, picture.age_s(self._loop.tick.now_s)

@@ -222,16 +222,16 @@ async def test_a_token_made_meanwhile_is_taken_and_a_damaged_file_locks_nobody_o
     tokens = Tokens(path)
     assert "graderd token create" in caplog.text
     first = create_token(path, "one", Right.READ).encode()
-    tokens.look()
+    tokens.reload()
     grant = tokens.grant_of(first)
     assert grant is not None
     assert (grant.name, grant.right, grant.ended.is_set()) == ("one", Right.READ, False)
     path.write_text("rubbish\n")
-    tokens.look()
+    tokens.reload()
     assert tokens.grant_of(first) is grant
     assert "this is no line" in caplog.text
     path.unlink()
-    tokens.look()
+    tokens.reload()
     assert tokens.grant_of(first) is None
     assert grant.ended.is_set()
 

@@ -35,10 +35,10 @@ from graderd.runtime.app.frame_sources import open_camera
 from graderd.runtime.perception_protocol import (
     Angle,
     CameraProblem,
-    Look,
     Observed,
     Opened,
     Preview,
+    PreviewFormat,
     RecordFrames,
     Saved,
     SaveFrame,
@@ -89,7 +89,7 @@ class Worker:
         self._angles = AngleHistory()
         self._attitude = UNMEASURED
         """The newest: lifts and tilt move a millimetre between frames."""
-        self._looks: queue.SimpleQueue[Look] = queue.SimpleQueue()
+        self._formats: queue.SimpleQueue[PreviewFormat] = queue.SimpleQueue()
         self._to_save: queue.SimpleQueue[SaveFrame] = queue.SimpleQueue()
         self._writers: dict[str, FrameSetWriter] = {}
         self._recorder: FrameRecorder | None = None
@@ -110,7 +110,7 @@ class Worker:
             elif isinstance(message, RecordFrames):
                 self._record(message.wanted)
             else:
-                self._looks.put(message.look)
+                self._formats.put(message.format)
         os._exit(0)
 
     def run(self) -> int:
@@ -165,10 +165,10 @@ class Worker:
                 recorder.take(Judged(frame, angle_deg, age_s, attitude, judged_s, observation))
             if not self._to_save.empty():
                 self._save(self._to_save.get(), frame, attitude)
-            while not self._looks.empty():
-                look = self._looks.get()
-                jpeg = _jpeg(classifier, frame, observation, look)
-                self._send(Preview(look=look, capture_s=frame.capture_s, jpeg_base64=jpeg))
+            while not self._formats.empty():
+                wanted = self._formats.get()
+                jpeg = _jpeg(classifier, frame, observation, wanted)
+                self._send(Preview(format=wanted, capture_s=frame.capture_s, jpeg_base64=jpeg))
 
     def _record(self, wanted: FramesWanted) -> None:
         """On the thread that listens: files are begun and ended beside the judging. It may be told twice."""
@@ -192,9 +192,9 @@ class Worker:
         self._send(Saved(id=wanted.id, problem=problem))
 
 
-def _jpeg(classifier: Classifier, frame: Frame, observation: SoilObservation, look: Look) -> str:
+def _jpeg(classifier: Classifier, frame: Frame, observation: SoilObservation, wanted: PreviewFormat) -> str:
     # Made smaller before anything is drawn: lines stay sharp, and a small picture costs little.
-    picture = classifier.annotate(no_wider(frame, look.width_px), observation, labels=look.labels)
+    picture = classifier.annotate(no_wider(frame, wanted.width_px), observation, labels=wanted.labels)
     ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return base64.b64encode(data.tobytes()).decode() if ok else ""
 
