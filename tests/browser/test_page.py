@@ -15,6 +15,7 @@ from playwright.sync_api import CDPSession, Page, expect
 from graderd.tokens import Right
 from tests.browser.conftest import Cab, shot
 
+pytestmark = pytest.mark.whole_machine
 VIEWS = ("work", "move", "health", "plots")
 PAGE_BYTES = 300_000
 SHOWN_NUMBERS = """[...document.querySelectorAll('[data-v], #jogs output')].map((e) => e.textContent)
