@@ -27,7 +27,7 @@ BESIDE := -n 2 --dist loadgroup
 # Two thirds of these tests' time is waiting, for virtual devices that move in real time.
 WAITING := -n 4 --dist loadgroup
 # What only computes takes what others leave of the processors, and is not missed by them.
-IDLE   := nice -n 19
+IDLE   := nice -n 19 env
 
 .PHONY: help run test unit quick passes peers test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb web-test web-lock bench-hw check format lock clean mutants mutants-wide claims core-coverage
 

@@ -6,6 +6,8 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -41,14 +43,21 @@ def test_a_socket_that_is_named_counts_more_than_any_other(tmp_path: Path, monke
     assert served_at(named, None).api.socket == "/somewhere/else.sock"
 
 
+@pytest.fixture
+def runtime() -> Iterator[Path]:
+    """Short, as /run/user/1000 is: a socket's path has 107 bytes at most, and pytest's own directories take 70."""
+    with tempfile.TemporaryDirectory(prefix="g-") as directory:
+        yield Path(directory)
+
+
 @pytest.mark.live
 @pytest.mark.whole_machine
-def test_run_sim_without_root_and_configuration_and_soil_laid_by_a_command(tmp_path: Path) -> None:
-    environment = {**os.environ, "GRADERD_SOCKET": str(tmp_path / "my.sock"), "XDG_RUNTIME_DIR": str(tmp_path)}
+def test_run_sim_without_root_and_configuration_and_soil_laid_by_a_command(runtime: Path) -> None:
+    environment = {**os.environ, "GRADERD_SOCKET": str(runtime / "my.sock"), "XDG_RUNTIME_DIR": str(runtime)}
     graderd = [sys.executable, "-m", "graderd"]
     daemon = subprocess.Popen([*graderd, "run", "--sim"], env=environment, stderr=subprocess.DEVNULL)
     try:
-        client = Client(tmp_path / "my.sock")
+        client = Client(runtime / "my.sock")
         client.until(lambda status: status.soil.frames_per_s > 0, 60, "pictures")
         laid = subprocess.run([*graderd, "rig", "scene", "left"], env=environment, check=True, capture_output=True)
         assert b"ok" in laid.stdout
@@ -61,4 +70,4 @@ def test_run_sim_without_root_and_configuration_and_soil_laid_by_a_command(tmp_p
     finally:
         daemon.send_signal(signal.SIGINT)
         assert daemon.wait(20) == 0
-    assert list(tmp_path.iterdir()) == [], "nothing is left behind"
+    assert list(runtime.iterdir()) == [], "nothing is left behind"
