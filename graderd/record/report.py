@@ -142,7 +142,7 @@ def _told(recording: Recording, story: Story) -> Iterator[Row]:
             if name not in present:
                 del open_faults[name]
         now = (row.get("decision"), row.get("decision_deg"))
-        if now != decided and now[0] is not None:
+        if now != decided and None not in now:  # one that a hold has taken the angle from is none
             story.decisions.append(Decided(at_s, row["wall_time"], now[0], now[1], row))
         decided = now
         for name, series in story.series.items():

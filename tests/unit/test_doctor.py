@@ -216,6 +216,7 @@ def test_no_secret_is_left_in_a_bundle(secret: str) -> None:
     assert left.endswith("after")
 
 
+@pytest.mark.live
 def test_a_bundle_has_what_a_report_needs_and_writes_over_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -235,6 +236,7 @@ def test_a_bundle_has_what_a_report_needs_and_writes_over_nothing(
     assert "there is such a file" in capsys.readouterr().err
 
 
+@pytest.mark.live
 def test_the_command_exits_with_1_where_something_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = tmp_path / "graderd.toml"
     config.write_text('[rotation]\nprofile = "none_such"\n')

@@ -22,6 +22,8 @@ from graderd.core.soil import Zone
 from graderd.perception.frame_set import MANIFEST, FrameSet, write_label
 from tests.replay.test_recordings import RECORDINGS
 
+pytestmark = pytest.mark.live
+
 
 @contextmanager
 def page_of(folder: Path) -> Iterator[tuple[Page, Labels]]:
