@@ -59,7 +59,7 @@ class Decided:
     at_s: float
     wall_time: str
     zone: str
-    angle_deg: float | None
+    angle_deg: float
     row: Row
     picture: str = ""
     depth: str = ""
@@ -141,10 +141,11 @@ def _told(recording: Recording, story: Story) -> Iterator[Row]:
             open_faults[name].to_s = at_s
             if name not in present:
                 del open_faults[name]
-        now = (row.get("decision"), row.get("decision_deg"))
-        if now != decided and None not in now:  # one that a hold has taken the angle from is none
-            story.decisions.append(Decided(at_s, row["wall_time"], now[0], now[1], row))
-        decided = now
+        zone, angle_deg = row.get("decision"), row.get("decision_deg")
+        # One that a hold has taken the angle from is none.
+        if (zone, angle_deg) != decided and zone is not None and angle_deg is not None:
+            story.decisions.append(Decided(at_s, row["wall_time"], zone, angle_deg, row))
+        decided = (zone, angle_deg)
         for name, series in story.series.items():
             if (value := row.get(name)) is not None:
                 series.add(at_s, value)
