@@ -399,7 +399,7 @@ def _plot(title: str, unit: str, lines: Sequence[tuple[str, str]], story: Story)
 
 def _decision(decided: Decided) -> str:
     row = decided.row
-    angle = "" if decided.angle_deg is None else f" &rarr; {decided.angle_deg:g}&deg;"
+    angle = f" &rarr; {decided.angle_deg:g}&deg;"
     thirds = [(third, row.get(f"ahead_{third}_l"), row.get(f"{third}_l")) for third in ("left", "center", "right")]
     litres = _rows(
         ("third", "ahead", "in all"),
