@@ -132,22 +132,23 @@ def test_can_utils_read_and_write_the_same_bus(ready: Grader, rig: Rig, listener
 def test_graderd_can_dump_shows_a_live_bus_with_all_kinds_of_frames(ready: Grader) -> None:
     """On an interface of the kernel's, as for somebody who looks at a bus that no daemon has."""
     bus.add_vcan(DUMPED, fd=True)
+    words = ["graderd", "can", "dump", DUMPED, "--json"]
     try:
-        dump = subprocess.Popen(["graderd", "can", "dump", DUMPED, "--json"], stdout=subprocess.PIPE, text=True)
-        try:
-            assert dump.stdout is not None
-            wait_for("graderd can dump to listen", lambda: bus_users(DUMPED), 20.0)
-            sent = ("18EF13E7#DC05191500000000", "18FEF180##1AABBCCDD", "20000040#0000000000000000", "18FEF180#R8")
-            for frame in sent:
-                run("cansend", DUMPED, frame)
-            seen = [json.loads(dump.stdout.readline()) for _ in sent]
-            assert [frame["kind"] for frame in seen] == ["data", "fd", "error", "remote"]
-            assert [frame["name"].split()[0] for frame in seen] == ["ACM", "CAN", "error", "remote"]
-            assert seen[2]["signals"]["state"] == "bus_off"
-            dump.send_signal(signal.SIGINT)
-            assert dump.wait(20.0) == 0
-        finally:
-            dump.kill()
+        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as dump:
+            try:
+                assert dump.stdout is not None
+                wait_for("graderd can dump to listen", lambda: bus_users(DUMPED), 20.0)
+                sent = ("18EF13E7#DC05191500000000", "18FEF180##1AABBCCDD", "20000040#0000000000000000", "18FEF180#R8")
+                for frame in sent:
+                    run("cansend", DUMPED, frame)
+                seen = [json.loads(dump.stdout.readline()) for _ in sent]
+                assert [frame["kind"] for frame in seen] == ["data", "fd", "error", "remote"]
+                assert [frame["name"].split()[0] for frame in seen] == ["ACM", "CAN", "error", "remote"]
+                assert seen[2]["signals"]["state"] == "bus_off"
+                dump.send_signal(signal.SIGINT)
+                assert dump.wait(20.0) == 0
+            finally:
+                dump.kill()
     finally:
         bus.remove_vcan(DUMPED)
 
