@@ -127,8 +127,9 @@ _NEAR_MM: Final = 8.0
 """From here on the pair goes no faster than they will."""
 _END_MM: Final = 3.0
 """This close to its target it stops by itself: nothing is learned there."""
-_STICKS: Final = 0.5
-"""A side that made less than this part of the way expected of it between two readings sticks."""
+_STICKS: Final = 0.65
+"""A side that made less than this part of the way expected of it between two readings sticks. One that stuck in the
+later two thirds of a period is seen with the next reading, one and a third periods after."""
 _STICKS_MM: Final = 0.7
 """And lacks at least so much: more than noise and the readings' times."""
 _AHEAD_N: Final = 3

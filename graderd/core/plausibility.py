@@ -106,7 +106,7 @@ def motion_figures(rotation: RotatorSettings, figures: Mapping[str, AxisFigures]
                 moved=0.5,
                 not_moving_s=0.7,
                 not_arriving_s=2.8,
-                wrong_way=4.0,
+                wrong_way=1.5,
                 wrong_way_s=0.0,
                 overspeed_margin=10.0,
             )
