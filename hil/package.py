@@ -3,9 +3,10 @@
 First the package itself: lintian finds no error, and a second build (another checkout, time zone, locale and umask,
 from an index that offers a newer version of everything) is the same file. Then, in a root of each Debian with systemd
 and Python and nothing else: ``apt install ./graderd_*.deb`` against Debian's archive; ``tests/hil/offline.sh`` there,
-which has upgrades fail, disks fill up, configurations come from newer versions; and a user-mode Linux guest that boots
-the root, where ``tests/hil/lifecycle.sh`` starts (``GRADERD_SIM=1``), uses, upgrades and purges the package as a
-newcomer would. Last a root of the older Debian that is brought to the newer one with the package in it.
+which has upgrades fail, disks fill up, configurations come from newer versions; ``tests/hil/users.sh``, where the
+daemon, an operator and a stranger use it; and a user-mode Linux guest that boots the root, where
+``tests/hil/lifecycle.sh`` starts (``GRADERD_SIM=1``), uses, upgrades and purges the package as a newcomer would. Last a
+root of the older Debian that is brought to the newer one with the package in it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from hil import uml
 from hil.newer_index import NewerIndex
 from hil.run import PROJECT, PYTHON, RESULTS, newest_package
 
-SCRIPTS = tuple(PROJECT / "tests" / "hil" / name for name in ("lifecycle.sh", "offline.sh"))
+SCRIPTS = tuple(PROJECT / "tests" / "hil" / name for name in ("lifecycle.sh", "offline.sh", "users.sh"))
 SUITES = ("bookworm", "trixie")
 # What hil/setup downloads into as well.
 CACHE = (
@@ -278,6 +279,7 @@ def main() -> int:
             apt_install(root, package)
             lay_out(root, package, scratch)
             in_root(root, "offline.sh", f"sh offline.sh all {package.name} newer.deb", show=True)
+            in_root(root, "users.sh", f"sh users.sh {package.name} newer.deb", show=True)
             status = status or live(root, package, RESULTS / "package" / suite)
         if not status and not options.suite and options.only in (None, "release-upgrade"):
             root = scratch / "upgraded"
