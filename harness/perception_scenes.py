@@ -118,30 +118,8 @@ def _cast(view: View, scene: Scene, heights: F64) -> tuple[F64, npt.NDArray[np.i
     """Depth (m, along the axis), what was hit (0 nothing, 1 ground, 2 soil, 3 blade), and where (x, y)."""
     rays = view.rays().reshape(-1, 3).astype(np.float64)
     origin = view.position_m
-    hit_t = np.full(len(rays), np.inf)
     kind = np.zeros(len(rays), dtype=np.int8)
-    # Soil and ground: march down the rays from where they come below the highest soil, then halve the last step.
-    top_m = max(float(heights.max()), 0.0)  # beyond the field it is level
-    ahead, open_rays = np.ascontiguousarray(rays.T), np.arange(len(rays))
-    before = 0.2
-    for t in np.arange(0.24, 3.4, 0.02):
-        (low_enough,) = np.nonzero(origin[2] + ahead[2] * t < top_m)
-        if low_enough.size:
-            x, y, z = (origin[axis] + ahead[axis][low_enough] * t for axis in range(3))
-            met = low_enough[z < _sample(heights, x, y)]
-            if met.size:
-                found, ways = open_rays[met], ahead[:, met]
-                low, high = np.full(found.size, before), np.full(found.size, t)
-                for _ in range(7):
-                    mid = (low + high) / 2
-                    x, y, z = (origin[axis] + ways[axis] * mid for axis in range(3))
-                    under = z < _sample(heights, x, y)
-                    low, high = np.where(under, low, mid), np.where(under, mid, high)
-                hit_t[found] = (low + high) / 2
-                left = np.ones(open_rays.size, dtype=bool)
-                left[met] = False
-                ahead, open_rays = np.ascontiguousarray(ahead[:, left]), open_rays[left]
-        before = t
+    hit_t = _march(rays, origin, heights)
     at = origin + rays * np.where(np.isfinite(hit_t), hit_t, 0.0)[:, None]
     kind[np.isfinite(hit_t)] = 1
     kind[np.isfinite(hit_t) & (_sample(heights, at[:, 0], at[:, 1]) > 0.008)] = 2
@@ -165,12 +143,47 @@ def _cast(view: View, scene: Scene, heights: F64) -> tuple[F64, npt.NDArray[np.i
     return hit_t, kind, at[:, 0], at[:, 1]
 
 
+def _march(rays: F64, origin: F64, heights: F64) -> F64:
+    """How far along each ray soil or ground lies; inf: nowhere near. In steps, from where the ray comes below the
+    highest soil; the one that went under is halved."""
+    steps = np.arange(0.24, 3.4, 0.02)
+    top_m = max(float(heights.max()), 0.0)  # beyond the field it is level
+    with np.errstate(all="ignore"):
+        enters = np.where(rays[:, 2] < 0.0, (top_m - origin[2]) / rays[:, 2], np.inf)
+    # Those that enter first stand first: at each step the next ones join.
+    order = np.argsort(enters, kind="stable")
+    joined = np.searchsorted(enters[order], steps, side="left")
+    ways = np.ascontiguousarray(rays[order].T)
+    met_at = np.zeros(len(rays), dtype=np.intp)
+    under_way = np.arange(0)
+    for number, (t, before, now) in enumerate(zip(steps, (0, *joined), joined, strict=False)):
+        under_way = np.concatenate((under_way, np.arange(before, now)))
+        if under_way.size:
+            x, y, z = (origin[axis] + ways[axis, under_way] * t for axis in range(3))
+            under = z < _sample(heights, x, y)
+            met_at[under_way[under]] = number + 1
+            under_way = under_way[~under]
+    met = np.flatnonzero(met_at)
+    ways = ways[:, met]
+    low, high = np.concatenate(((0.2,), steps))[met_at[met] - 1], steps[met_at[met] - 1]
+    for _ in range(7):
+        mid = (low + high) / 2
+        x, y, z = (origin[axis] + ways[axis] * mid for axis in range(3))
+        under = z < _sample(heights, x, y)
+        low, high = np.where(under, low, mid), np.where(under, mid, high)
+    hit_t = np.full(len(rays), np.inf)
+    hit_t[order[met]] = (low + high) / 2
+    return hit_t
+
+
 def _sample(heights: F64, x: F64, y: F64) -> F64:
     i = ((x - X0) / CELL_M).astype(np.int64)
     j = ((y - Y0) / CELL_M).astype(np.int64)
-    inside = (i >= 0) & (j >= 0) & (i < heights.shape[0]) & (j < heights.shape[1])
-    held = heights[i.clip(0, heights.shape[0] - 1), j.clip(0, heights.shape[1] - 1)]
-    return np.asarray(np.where(inside, held, 0.0), dtype=np.float64)
+    rows, columns = heights.shape
+    inside = (i >= 0) & (j >= 0) & (i < rows) & (j < columns)
+    cells = i * columns + j
+    cells *= inside
+    return np.asarray(heights.reshape(-1)[cells] * inside, dtype=np.float64)
 
 
 def render(
