@@ -141,20 +141,17 @@ class SoilField:
         largest = 0.0
         for number in range(passes):
             for upper, lower, distance in _NEIGHBOURS:
-                step = surface[upper] - surface[lower]
-                down = np.maximum(step - drop_m * distance, 0.0)
-                up = np.maximum(-step - drop_m * distance, 0.0)
+                down = surface[upper] - surface[lower]
+                down -= np.maximum(np.minimum(down, drop_m * distance), -drop_m * distance)
                 if wall is not None:
-                    down *= free[upper]
-                    up *= free[lower]
-                down -= up
+                    down *= np.where(down > 0.0, free[upper], free[lower])
                 down *= _RATE
                 if number == passes - 1:
-                    largest = max(largest, float(np.abs(down).max(initial=0.0)))
+                    largest = max(largest, float(down.max(initial=0.0)), -float(down.min(initial=0.0)))
                 heights[upper] -= down
                 heights[lower] += down
                 if wall is not None:
-                    surface = heights.copy()
+                    np.copyto(surface, heights)
                     surface.reshape(-1)[wall.flat] = np.maximum(wall.top_m, heights.reshape(-1)[wall.flat])
         return largest
 
