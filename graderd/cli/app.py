@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+import typer.main
 from typer import Abort, TyperException
 
 from graderd.cli import (
@@ -100,7 +102,7 @@ def run_app(arguments: list[str]) -> int:
     """
     as_json = "--json" in arguments
     try:
-        result = make_cli()(arguments, prog_name="graderd", standalone_mode=False)
+        result = _parser()(arguments, prog_name="graderd", standalone_mode=False)
     except CliError as error:
         print_error(error.where, error.cause, error.remedy, as_json)
         return error.exit_code
@@ -133,6 +135,12 @@ def run_app(arguments: list[str]) -> int:
     if result == INTERRUPTED:
         raise KeyboardInterrupt
     return result if isinstance(result, int) else ExitCode.OK
+
+
+@cache
+def _parser() -> Any:
+    """Read from the signatures of all commands, once in a process."""
+    return typer.main.get_command(make_cli())
 
 
 def _print_version(wanted: bool) -> None:

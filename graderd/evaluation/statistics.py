@@ -103,18 +103,24 @@ def differences_of(rows: Sequence[Row], confidence: float) -> list[Difference]:
             continue
         samples = [row.values for row in group]
         whole = stats.f_oneway(*samples, equal_var=False)
-        each = stats.tukey_hsd(*samples, equal_var=False)
-        bounds = each.confidence_interval(confidence)
-        pairs = tuple(
-            Pair(
-                group[a].angle_deg,
-                group[b].angle_deg,
-                float(each.statistic[a, b]),
-                float(bounds.low[a, b]),
-                float(bounds.high[a, b]),
-                float(each.pvalue[a, b]),
-            )
-            for a, b in combinations(range(len(group)), 2)
-        )
+        pairs = tuple(_pair(a, b, len(group), confidence) for a, b in combinations(group, 2))
         found.append(Difference(case, measure, float(whole.statistic), float(whole.pvalue), pairs))
     return found
+
+
+def _pair(one: Row, other: Row, angles_n: int, confidence: float) -> Pair:
+    """Games and Howell's test of two rows out of ``angles_n``: scipy's ``tukey_hsd``, which takes three times as long,
+    as it integrates for each pair both ways round, and for each angle against itself."""
+    shares = [float(np.var(row.values, ddof=1)) / row.trials_n for row in (one, other)]
+    freedom = sum(shares) ** 2 / sum(
+        share**2 / (row.trials_n - 1) for share, row in zip(shares, (one, other), strict=True)
+    )
+    error = math.sqrt(sum(shares) / 2.0)
+    difference = one.value - other.value
+    if angles_n == 2:  # the range of two is Student's t, without an integral
+        half = float(stats.t.ppf((1.0 + confidence) / 2.0, freedom)) * math.sqrt(2.0) * error
+        p = 2.0 * float(stats.t.sf(abs(difference) / error / math.sqrt(2.0), freedom))
+    else:
+        half = float(stats.studentized_range.ppf(confidence, angles_n, freedom)) * error
+        p = float(stats.studentized_range.sf(abs(difference) / error, angles_n, freedom))
+    return Pair(one.angle_deg, other.angle_deg, difference, difference - half, difference + half, p)

@@ -64,10 +64,11 @@ def test_height_within_a_millimetre_and_spread_within_a_hundredth(seed: int) -> 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_stated_interval_holds_the_truth_in_ninety_of_a_hundred() -> None:
+    """A quarter of the beds in the small cells that take three times as long."""
     held = dict.fromkeys((*SPREADS, "height_difference_mm"), 0)
     for seed in range(100):
         known = known_bed(seed, 270.0, HALF_VIEW)
-        for name, each in known.estimated(4, 20.0 if seed % 2 else 10.0).items():
+        for name, each in known.estimated(4, 20.0 if seed % 4 else 10.0).items():
             low, high = interval(each, 0.95)
             assert low is not None
             assert high is not None
