@@ -30,8 +30,8 @@ UNIT = Path(__file__).with_name("unit")
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """A unit test that is not ``live`` is ``pure``; whole machines take turns, in two groups, whatever else runs beside
-    them; every asynchronous test gets the check for leaked tasks, synchronous ones need no event loop."""
+    """A unit test that is not ``live`` is ``pure``; whole machines take turns, in three groups, whatever else runs
+    beside them; every asynchronous test gets the check for leaked tasks, synchronous ones need no event loop."""
     for item in items:
         if UNIT in item.path.parents and not item.get_closest_marker("live"):
             item.add_marker("pure")

@@ -13,7 +13,7 @@ from graderd.core.status import Status
 from hil import bench
 from tests.machine import machine
 
-pytestmark = [pytest.mark.whole_machine, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.whole_machine, pytest.mark.xdist_group("beside a machine"), pytest.mark.timeout(240)]
 
 
 def motions(asked: list[str]) -> list[str]:

@@ -18,7 +18,7 @@ import pytest
 from graderd.simulator.control_client import RigControl
 from tests.machine import Served, standing_machine
 
-pytestmark = [pytest.mark.whole_machine, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.whole_machine, pytest.mark.xdist_group("beside a machine"), pytest.mark.timeout(240)]
 
 
 @pytest.fixture(scope="module")

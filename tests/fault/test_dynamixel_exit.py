@@ -41,7 +41,7 @@ asyncio.run(main())
 
 
 @pytest.mark.whole_machine
-@pytest.mark.xdist_group("beside a machine")
+@pytest.mark.xdist_group("a line")
 @pytest.mark.parametrize("way", ["killed", "stopped", "unplugged"])
 def test_from_loss_of_link_to_standstill_the_watchdog_bounds_it(
     tmp_path: Path, way: str, capsys: pytest.CaptureFixture[str]

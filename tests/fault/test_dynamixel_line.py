@@ -32,7 +32,7 @@ async def bus(rig: Bench) -> AsyncIterator[ServoBus]:
 
 
 @pytest.mark.whole_machine
-@pytest.mark.xdist_group("beside a machine")
+@pytest.mark.xdist_group("a line")
 @pytest.mark.timeout(60)
 async def test_15_percent_loss_is_told_and_nothing_else_happens(tmp_path: Path) -> None:
     """As many exchanges as in a minute at the default poll rate."""

@@ -118,6 +118,7 @@ async def lose_some(rig: Bench) -> None:
 
 
 @pytest.mark.whole_machine
+@pytest.mark.xdist_group("a line")
 async def test_with_15_percent_of_the_exchanges_lost(rig: Bench) -> None:
     """Of twelve stops, some lose the hold, some the reading before it, some both. Who withholds the processor for a
     moment adds to what the line loses, until the servo counts as gone: then the blade stands, and is armed again."""

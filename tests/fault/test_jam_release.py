@@ -25,7 +25,7 @@ LOOK_S = 0.002
 
 
 @pytest.mark.whole_machine
-@pytest.mark.xdist_group("beside a machine")
+@pytest.mark.xdist_group("a line")
 async def test_a_jam_that_frees_does_not_leap(tmp_path: Path) -> None:
     config = Config.model_validate({"rotation": {"not_moving_s": NOT_MOVING_S}})
     speed = config.rotation.speed_deg_per_s

@@ -27,7 +27,7 @@ from tests.unit.test_cli_offline import leaf_commands
 from tests.users import CONFIG, DAEMON, OPERATOR, ROOT, STATE, STRANGER, Machine, environment, three_users
 
 # One machine for all of them; none measures time.
-pytestmark = [pytest.mark.whole_machine, pytest.mark.xdist_group("beside a machine"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.whole_machine, pytest.mark.xdist_group("a line"), pytest.mark.timeout(600)]
 READY_S = 120.0
 POSE = "0.9,0.05,0.6,30,1,-1"
 USERS = (DAEMON, OPERATOR, STRANGER)

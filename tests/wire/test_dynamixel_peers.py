@@ -31,7 +31,7 @@ from rustypot import Xl430PyController
 from tests.dynamixel_sim import TIMEOUT_S, ServoProcess, servo_process
 
 # The SDK gives up after 34 ms, and is asked again.
-pytestmark = [pytest.mark.whole_machine, pytest.mark.xdist_group("beside a machine")]
+pytestmark = [pytest.mark.whole_machine, pytest.mark.xdist_group("a line")]
 IDS = (1, 3, 7)
 STUFFED = -131073  # FF FF FD FF on the wire: the payload that must be stuffed
 T = TypeVar("T")

@@ -169,7 +169,7 @@ async def read_line(stream: asyncio.StreamReader) -> dict[str, Any]:
 
 
 @pytest.mark.whole_machine
-@pytest.mark.xdist_group("beside a machine")
+@pytest.mark.xdist_group("a line")
 async def test_the_virtual_actuators_run_alone_and_take_faults_on_standard_input(tmp_path: Path) -> None:
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "graderd.simulator.actuators", "--link", str(tmp_path / "can"),
