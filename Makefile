@@ -4,6 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 LOCKED := $(VENV)/.locked
 STAMP  := $(VENV)/.installed
+STUDY  := $(VENV)/.study
 # Seconds instead of a minute or so where it is on PATH; `make UV=` does without.
 ifeq ($(origin UV),undefined)
 UV     := $(shell uv --version >/dev/null 2>&1 && echo uv)
@@ -31,7 +32,7 @@ MACHINES := -n 3 --dist loadgroup
 # What only computes takes what others leave of the processors, and is not missed by them.
 IDLE   := nice -n 19 env
 
-.PHONY: help run test unit quick passes peers test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb web-test web-lock bench-hw check format lock clean mutants mutants-wide claims core-coverage
+.PHONY: help run test unit quick passes peers test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb web-test web-lock study study-test study-lock bench-hw check format lock clean mutants mutants-wide claims core-coverage
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
@@ -147,6 +148,15 @@ web-test: $(STAMP) ## the operator page in a headless Chromium, on rig and daemo
 	@$(INSTALL) --require-hashes -r tests/browser/requirements.txt >$(LOG) 2>&1 || $(because)
 	@$(TESTS) -o addopts="-ra --strict-markers --strict-config" $(PYTEST_ARGS) tests/browser
 
+study: $(STUDY) ## install what `graderd study` needs into .venv (once, 200 MB to download)
+
+study-test: $(STUDY) ## the study's tests on its engine: single grains, small piles, killed workers
+	@$(TESTS) -o addopts="-ra --strict-markers --strict-config" $(PYTEST_ARGS) tests/study
+
+$(STUDY): $(STAMP) studies/requirements.lock
+	@$(INSTALL) --only-binary :all: --require-hashes -r studies/requirements.lock >$(LOG) 2>&1 || $(because)
+	@touch $@
+
 bench-hw: $(STAMP) ## tests against real hardware; asks before each motion (needs GRADERD_BENCH=1 and a terminal)
 	@PYTHONPATH=. $(BIN)/python -m hil.bench $(BENCH_ARGS)
 
@@ -177,11 +187,20 @@ format: $(STAMP) ## apply the formatter and the safe fixes
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
-lock: $(LOCKED) ## pin what pyproject.toml names; pins in force stay (LOCK_ARGS="--upgrade-package numpy", --upgrade for all)
-	@$(BIN)/uv pip compile --universal --python-version 3.11 --all-extras --generate-hashes --custom-compile-command "make lock" --quiet --output-file requirements.lock $(LOCK_ARGS) pyproject.toml
+# All of them but what a study takes, which would be half as much again.
+EXTRAS = $$($(BIN)/python -c 'import tomllib; extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; print(*(f"--extra {name}" for name in extras if name != "study"))')
 
-web-lock: $(LOCKED) ## pin what tests/browser/requirements.in names (LOCK_ARGS as for lock)
+lock: $(LOCKED) ## pin what pyproject.toml names; pins in force stay (LOCK_ARGS="--upgrade-package numpy", --upgrade for all)
+	@$(BIN)/uv pip compile --universal --python-version 3.11 $(EXTRAS) --generate-hashes --custom-compile-command "make lock" --quiet --output-file requirements.lock $(LOCK_ARGS) pyproject.toml
+
+web-# All of them but what a study takes, which would be half as much again.
+EXTRAS = $$($(BIN)/python -c 'import tomllib; extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; print(*(f"--extra {name}" for name in extras if name != "study"))')
+
+lock: $(LOCKED) ## pin what tests/browser/requirements.in names (LOCK_ARGS as for lock)
 	@$(BIN)/uv pip compile --universal --python-version 3.11 --generate-hashes --custom-compile-command "make web-lock" --quiet --constraint requirements.lock --output-file tests/browser/requirements.txt $(LOCK_ARGS) tests/browser/requirements.in
+
+study-lock: $(LOCKED) ## pin what the extra study needs beside requirements.lock (LOCK_ARGS as for lock)
+	@$(BIN)/uv pip compile --universal --python-version 3.11 --extra study --generate-hashes --custom-compile-command "make study-lock" --quiet --constraint requirements.lock --output-file studies/requirements.lock $(LOCK_ARGS) pyproject.toml
 
 clean: ## remove what the targets above made
 	rm -rf $(VENV) $(PYTHONS:%=.venv-%) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

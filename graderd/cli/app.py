@@ -28,6 +28,7 @@ from graderd.cli import (
     report,
     rotation,
     status,
+    study,
     token,
 )
 from graderd.cli.console import CliError, ExitCode, print_error, print_text
@@ -52,6 +53,7 @@ COMMANDS = (
     classify,
     label,
     evaluate,
+    study,
     calibrate,
     token,
     doctor,
