@@ -193,10 +193,7 @@ EXTRAS = $$($(BIN)/python -c 'import tomllib; extras = tomllib.load(open("pyproj
 lock: $(LOCKED) ## pin what pyproject.toml names; pins in force stay (LOCK_ARGS="--upgrade-package numpy", --upgrade for all)
 	@$(BIN)/uv pip compile --universal --python-version 3.11 $(EXTRAS) --generate-hashes --custom-compile-command "make lock" --quiet --output-file requirements.lock $(LOCK_ARGS) pyproject.toml
 
-web-# All of them but what a study takes, which would be half as much again.
-EXTRAS = $$($(BIN)/python -c 'import tomllib; extras = tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]; print(*(f"--extra {name}" for name in extras if name != "study"))')
-
-lock: $(LOCKED) ## pin what tests/browser/requirements.in names (LOCK_ARGS as for lock)
+web-lock: $(LOCKED) ## pin what tests/browser/requirements.in names (LOCK_ARGS as for lock)
 	@$(BIN)/uv pip compile --universal --python-version 3.11 --generate-hashes --custom-compile-command "make web-lock" --quiet --constraint requirements.lock --output-file tests/browser/requirements.txt $(LOCK_ARGS) tests/browser/requirements.in
 
 study-lock: $(LOCKED) ## pin what the extra study needs beside requirements.lock (LOCK_ARGS as for lock)
