@@ -131,6 +131,10 @@ class _Work:
         dangerous = sum(engine.dangerous_builds(path.read_text()) for path in self._folder.glob("push.*.log"))
         density = deck.soil_of(case).density_kg_per_m3
         measures = outcome.measures(case, frames, forces, along, plan_.contact_step * self._dt)
+        if case.motion == "coupled":
+            from graderd.studies.blade_rotation import coupled  # needs MuJoCo
+
+            measures |= coupled.measures(self._folder, plan_.contact_step * self._dt)
         checks = outcome.checks(frames, forces, density, dangerous)
         tables = outcome.tables(case, frames, forces, along)
         result = Result(
