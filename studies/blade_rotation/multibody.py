@@ -287,7 +287,8 @@ class Rigid:
     def advance(self, wrench: Wrench, yaw_rad: float, duration_s: float) -> Pose:
         """See :class:`Holder`."""
         now, self._wrench = self._pose, wrench
-        place = tuple(p + v * duration_s for p, v in zip(now.place_m, now.velocity_m_per_s, strict=True))
+        (x, y, z), (vx, vy, vz) = now.place_m, now.velocity_m_per_s
+        place = (x + vx * duration_s, y + vy * duration_s, z + vz * duration_s)
         rate = (yaw_rad - now.yaw_rad) / duration_s
         self._pose = replace(now, place_m=place, yaw_rad=yaw_rad, yaw_rad_per_s=rate)
         return self._pose
