@@ -6,8 +6,8 @@ Scheme: conventional serial staggered, explicit. In each coupling step
 
 1. the engine runs with the blade in steady motion and sums up force and moment on it at every one of its steps;
 2. the machine runs over the same time under their mean, so that the impulse it takes is the impulse the soil gave;
-3. the blade's next steady motion is that which leads from where the engine has it to where the machine, going on as it
-   did in this step, will have it at the end of the next. So the place never jumps, and the two places cannot drift apart.
+3. the blade's next steady motion is that which leads from where the engine has it to where the machine, going on as
+   it did in this step, will have it at the end of the next. So the place never jumps, and the two cannot drift apart.
 
 What the interface gains or loses is the force times the difference of the two motions; it is summed up and told.
 The engine turns the blade about the vertical and moves it in x, y and z; roll and pitch stay in the machine (they are
