@@ -20,6 +20,7 @@ PYTHON_TARGETS ?= run test
 # Any that is there; pyenv's names on PATH start only the version that PYENV_VERSION names.
 FIND_PYTHON = PYENV_VERSION=$* $(BIN)/uv python find --system --no-python-downloads
 SOAK_S ?= 900
+INTERFACE_EXAMPLES ?= 100
 
 # Tests start a hundred processes: byte code is kept, in .venv, whatever the shell says of it (it is half of a start).
 # numpy with a thread of its own for each test, as the command line has it.
@@ -32,7 +33,7 @@ MACHINES := -n 3 --dist loadgroup
 # What only computes takes what others leave of the processors, and is not missed by them.
 IDLE   := nice -n 19 env
 
-.PHONY: help run test unit quick passes peers test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb web-test web-lock study study-test study-lock bench-hw check format lock clean mutants mutants-wide claims core-coverage
+.PHONY: help run test unit quick passes peers test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb web-test web-lock study study-test study-lock interface bench-hw check format lock clean mutants mutants-wide claims core-coverage
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
@@ -156,6 +157,9 @@ study-test: $(STUDY) ## the study's tests on its engine: single grains, small pi
 $(STUDY): $(STAMP) studies/requirements.lock
 	@$(INSTALL) --only-binary :all: --require-hashes -r studies/requirements.lock >$(LOG) 2>&1 || $(because)
 	@touch $@
+
+interface: $(STAMP) ## the interface against its own description, by Schemathesis on rig and daemon (INTERFACE_EXAMPLES a path)
+	@GRADERD_INTERFACE_EXAMPLES=$(INTERFACE_EXAMPLES) $(TESTS) $(PYTEST_ARGS) tests/fault/test_openapi.py
 
 bench-hw: $(STAMP) ## tests against real hardware; asks before each motion (needs GRADERD_BENCH=1 and a terminal)
 	@PYTHONPATH=. $(BIN)/python -m hil.bench $(BENCH_ARGS)

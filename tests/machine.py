@@ -125,10 +125,11 @@ async def machine(directory: Path, more_config: str = "") -> AsyncIterator[Machi
 
 
 @contextmanager
-def standing_machine(directory: Path) -> Iterator[Served]:
-    """A patient one for several tests, each with an event loop of its own, which leave it armed or not, but alive."""
+def standing_machine(directory: Path, more_config: str = "") -> Iterator[Served]:
+    """A patient one for several tests, each with an event loop of its own, which leave it armed or not, but alive.
+    ``more_config``: further TOML."""
     socket_path = directory / "graderd.sock"
-    config = CONFIG.format(socket=socket_path) + PICTURES + PATIENT
+    config = CONFIG.format(socket=socket_path) + PICTURES + PATIENT + more_config
     (directory / "graderd.toml").write_text(config, encoding="utf-8")
     words = ("run", "--config", str(directory / "graderd.toml"), "--rig-dir", str(directory))
     with running_rig(directory), subprocess.Popen([sys.executable, "-m", "graderd", *words]) as daemon:

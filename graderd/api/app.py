@@ -10,6 +10,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.routing import Match
 
 from graderd.api.http_routes import StatusTexts, http_routes
 from graderd.api.limiter import Closing, Limiter
@@ -49,6 +50,7 @@ EVERYWHERE = {
     "503": "too many requests; stop is served all the same",
 }
 """What any request may be answered with, beside what its route says of itself."""
+METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
 SECURITY = {
     "bearer": {"type": "http", "scheme": "bearer", "description": "a token that 'graderd token create' made (TCP)"},
     "cookie": {"type": "apiKey", "in": "cookie", "name": "graderd_token", "description": "set by POST /v1/session"},
@@ -123,7 +125,8 @@ def _handlers() -> dict[type[Exception], Callable[[Request, Exception], Awaitabl
         problem = Problem(
             error=str(error.detail), where=request.url.path[:200], remedy="the paths are listed at /v1/openapi.json"
         )
-        return JSONResponse(problem.model_dump(), status_code, error.headers)
+        headers = {"Allow": _allowed(request)} if status_code == 405 else error.headers
+        return JSONResponse(problem.model_dump(), status_code, headers)
 
     async def crashed(request: Request, _: Exception) -> JSONResponse:
         problem = Problem(
@@ -139,6 +142,13 @@ def _handlers() -> dict[type[Exception], Callable[[Request, Exception], Awaitabl
         HTTPException: http_error,
         Exception: crashed,
     }
+
+
+def _allowed(request: Request) -> str:
+    """The methods of a path: a router that has a route for each tells those of the first alone."""
+    scopes = {method: {**request.scope, "method": method} for method in METHODS}
+    routes = request.app.routes
+    return ", ".join(m for m, scope in scopes.items() if any(r.matches(scope)[0] is Match.FULL for r in routes))
 
 
 def _version() -> str:

@@ -58,19 +58,24 @@ NAMES_N = 1000
 STOP_BODY: dict[str, Any] = {
     "requestBody": {
         "required": False,
-        "description": "may be left out; never a reason to refuse the stop",
+        "description": "may be left out; whatever it is, never a reason to refuse the stop",
         "content": {
             "application/json": {
                 "schema": {
-                    "type": "object",
-                    "properties": {
-                        "client": {"type": "string", "maxLength": 80, "description": "who asks"},
-                        "reason": {
-                            "type": "string",
-                            "maxLength": 200,
-                            "description": "kept as the reason of the stop; more is cut off",
+                    "anyOf": [
+                        {
+                            "type": "object",
+                            "properties": {
+                                "client": {"type": "string", "maxLength": 80, "description": "who asks"},
+                                "reason": {
+                                    "type": "string",
+                                    "maxLength": 200,
+                                    "description": "kept as the reason of the stop; more is cut off",
+                                },
+                            },
                         },
-                    },
+                        {"description": "anything else: what is text of it is the reason"},
+                    ]
                 },
                 "example": {"reason": "person near the blade"},
             }

@@ -35,6 +35,9 @@ from graderd.hal.clock import Pace
 from graderd.hal.errors import DeviceError
 from graderd.tokens import Right
 
+if TYPE_CHECKING:
+    from uvicorn._types import ASGISendEvent
+
 MAX_PATH_BYTES = 107
 SOCKET_CHECK_S = 1.0
 
@@ -546,6 +549,12 @@ class _StreamProtocol(_SmallReads, WebSocketsSansIOProtocol):
             self.transport.write(answer)
         else:
             self._pong = answer or self._pong
+
+    async def send(self, message: ASGISendEvent) -> None:
+        """As in uvicorn, which takes a refusal for no answer, and would write a line for each into the log."""
+        await super().send(message)
+        if self.close_sent:
+            self.handshake_complete = True
 
     def resume_writing(self) -> None:
         super().resume_writing()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
@@ -14,8 +14,24 @@ ClientText = Annotated[str, AfterValidator(printable)]
 it comes in, so that nobody further on has to think of it."""
 
 
+def _told_apart(schema: dict[str, Any]) -> None:
+    """A command has to say which it is; here it has a default, which a schema takes for leave to omit it."""
+    schema["required"] = ["command", *schema.get("required", [])]
+
+
+def _never_refused(schema: dict[str, Any]) -> None:
+    """Whatever else a stop says, it is one."""
+    _told_apart(schema)
+    schema["additionalProperties"] = True
+    for name in ("client", "reason"):
+        kept = schema["properties"][name]
+        schema["properties"][name] = {
+            "description": f"text; more than {kept['maxLength']} characters are cut off, anything else is left out"
+        }
+
+
 class _Command(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, json_schema_extra=_told_apart)
 
     client: ClientText = Field("", max_length=80, description="who asks; one client commands at a time")
 
@@ -34,6 +50,8 @@ class Disarm(_Command):
 
 class Stop(_Command):
     """End motion at once and latch. Wins over everything; idempotent."""
+
+    model_config = ConfigDict(json_schema_extra=_never_refused)
 
     command: Literal["stop"] = "stop"
     reason: ClientText = Field("stop command", max_length=200)

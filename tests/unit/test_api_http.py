@@ -149,6 +149,8 @@ async def test_paths_and_methods_that_do_not_exist(tmp_path: Path) -> None:
         assert (await client.get("/nothing")).status_code == 404
         assert (await client.get("/nothing")).json()["where"] == "/nothing"
         assert (await client.delete("/v1/status")).status_code == 405
+        for other, allowed in (("/v1/status", "GET"), ("/v1/session", "GET, POST, DELETE"), ("/", "GET, HEAD")):
+            assert (await client.patch(other)).headers["allow"] == allowed
         for stream in ("/v1/stream", "/v1/jog", "/v1/bus/can"):
             answer = await client.get(stream)
             assert answer.status_code == 426
