@@ -59,7 +59,7 @@ class ServoLink:
         list_ports: ListPorts,
     ) -> None:
         self.firmware_version: int | None = None
-        self.happened: Counter[str] = Counter()
+        self.happened: Counter[str] = Counter(reconnects_n=0, goal_timeouts_n=0)
         self.bus: ServoBus | None = None
         self.slow_adapter: DeviceFault | None = None
         """The present adapter holds bytes back, which makes every reply late, whatever the baud rate."""
@@ -192,10 +192,12 @@ class ServoLink:
             self.happened.update(counted)
 
     def counters(self) -> dict[str, int]:
-        """Everything since the beginning, over all connections; ``low_latency_n`` is of the present one."""
+        """Everything since the beginning, over all connections, what never happened too: a rate begins at 0.
+        ``low_latency_n`` is of the present one."""
         now = Counter(self.bus.counters()) if self.bus is not None else Counter[str]()
         low_latency_n = now.pop("low_latency_n", 0)
-        return {**(self.happened + now), "low_latency_n": low_latency_n}
+        names = dict.fromkeys((*self.happened, *now))  # a sum of counters would drop what is 0
+        return {**{name: self.happened[name] + now[name] for name in names}, "low_latency_n": low_latency_n}
 
     def silence(self) -> tuple[float, int]:
         """Seconds since the last valid status packet, and requests without an answer since."""

@@ -14,6 +14,7 @@ from starlette.routing import Match
 
 from graderd.api.http_routes import StatusTexts, http_routes
 from graderd.api.limiter import Closing, Limiter
+from graderd.api.metrics import metrics_routes
 from graderd.api.page import page_routes
 from graderd.api.port import DaemonPort
 from graderd.api.problem import Problem, ProblemError, problem_of_validation
@@ -79,6 +80,7 @@ def make_app(port: DaemonPort, limits: ApiLimits | None = None) -> FastAPI:
     app.include_router(http_routes(port, limits, texts, app.state.stops))
     app.include_router(socket_routes(port, limits, texts, app.state.closing, app.state.stops))
     app.include_router(session_routes())
+    app.include_router(metrics_routes(port))
     app.include_router(page_routes())
     app.add_middleware(Limiter, limits=limits, closing=app.state.closing)
     for kind, handler in _handlers().items():

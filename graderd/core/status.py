@@ -103,7 +103,8 @@ class SoilStatus(_Status):
 
 class DecisionStatus(_Status):
     """What automatic operation decided last. ``kept``: it stands for a pass that is not over, for ``since_m`` so far
-    as it told its travel (null where it never did). ``angle_deg`` null with a zone: a hold took it away in mid-pass."""
+    as it told its travel (null where it never did). ``angle_deg`` null with a zone: a hold took it away in mid-pass.
+    ``decisions_n``: since the daemon's start."""
 
     zone: Zone | None = None
     angle_deg: float | None = None
@@ -111,6 +112,7 @@ class DecisionStatus(_Status):
     kept: bool = False
     since_m: float | None = None
     reason: str = ""
+    decisions_n: int = 0
 
 
 class VehicleStatus(_Status):
@@ -154,10 +156,11 @@ class LeaseStatus(_Status):
 
 class CameraStatus(_Status):
     """The perception worker and its camera. ``settings_read_back``: what the camera itself said it was set to, when it
-    was opened last, ``settings_age_s`` ago."""
+    was opened last, ``settings_age_s`` ago. ``frames_n``: observations since the daemon's start."""
 
     lifecycle: Lifecycle = Lifecycle.CLOSED
     description: str = ""
+    frames_n: int = 0
     restarts_n: int = 0
     recovery: str = ""
     settings_read_back: dict[str, float] = {}
@@ -165,11 +168,22 @@ class CameraStatus(_Status):
 
 
 class TickStatus(_Status):
-    """Health of the control tick; ``lateness_p99_ms``: of the last 500."""
+    """Health of the control tick; ``ticks_n``: since the daemon's start, ``lateness_p99_ms``: of the last 500."""
 
     rate_hz: float = 0.0
+    ticks_n: int = 0
     overruns_n: int = 0
     lateness_p99_ms: float = 0.0
+
+
+class RecordingStatus(_Status):
+    """The recorder. ``run``, ``incident``: such a file is open; ``waiting_n``: what is not in it yet; ``lost_n``: ticks
+    that disk or processor were too slow for, since the daemon's start."""
+
+    run: bool = False
+    incident: bool = False
+    waiting_n: int = 0
+    lost_n: int = 0
 
 
 class Status(_Status):
@@ -195,4 +209,5 @@ class Status(_Status):
     lease: LeaseStatus | None = None
     camera: CameraStatus = CameraStatus()
     tick: TickStatus = TickStatus()
+    recording: RecordingStatus = RecordingStatus()
     presets: tuple[str, ...] = ()

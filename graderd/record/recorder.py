@@ -30,6 +30,7 @@ from typing import NamedTuple, Protocol
 from graderd.config import Config
 from graderd.core.faults.monitor import Reaction
 from graderd.core.machine import ARMED, Mode
+from graderd.core.status import RecordingStatus
 from graderd.core.tick import Controller, Sensed, Tick, TickSettings
 from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.reading import Reading
@@ -117,7 +118,7 @@ class Recorder:
         self._writer = None if directory is None else _Files(config, Store(directory, own.max_mb, own.min_free_mb))
         self._queue: deque[Item] = deque()
         self._lines: dict[str, deque[str]] = {}
-        self._lost_n = 0
+        self._lost_n = self._lost_ever_n = 0
         self._memory_due_s = self._wires_due_s = -math.inf
 
     @property
@@ -134,6 +135,7 @@ class Recorder:
         self._writer.now_s = tick.now_s
         if len(self._queue) >= QUEUE_N:
             self._lost_n += 1
+            self._lost_ever_n += 1
             return
         if self._lost_n:
             self._queue.append(Mark(kind="lost", lost_n=self._lost_n, text="the disk or the processor did not keep up"))
@@ -176,6 +178,13 @@ class Recorder:
     def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """Why nothing is written now."""
         return () if self._writer is None else self._writer.faults.present(now_s)
+
+    def status(self) -> RecordingStatus:
+        """For people; what the thread has open may be a moment old."""
+        if self._writer is None:
+            return RecordingStatus()
+        run, incident = self._writer.open
+        return RecordingStatus(run=run, incident=incident, waiting_n=len(self._queue), lost_n=self._lost_ever_n)
 
     # ---- what goes out --------------------------------------------------------------------------------------------
 
@@ -256,6 +265,11 @@ class _Files:
         self._every_n = 0
         self._gap = ""
         self._tell_frames: Callable[[FramesWanted], None] = lambda _: None
+
+    @property
+    def open(self) -> tuple[bool, bool]:
+        """Whether a run, and the black box, are being written."""
+        return self._run is not None, self._box is not None
 
     def work(
         self,

@@ -59,6 +59,7 @@ class ControlLoop:
     ``fault_sources``: told the time, each says what it sees wrong now. ``on_tick``: called at the end of every tick.
     ``on_step``: called with what every step of the controller knew and decided, those of a stop between two ticks
     included; the wires have been told by then. ``controller`` and its ``settings`` are for the recorder to read.
+    ``ticks_n``, ``decisions_n``: since the start.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class ControlLoop:
         state_file: StateFile,
     ) -> None:
         self.lateness_s: deque[float] = deque(maxlen=LATENESS_WINDOW_N)
+        self.ticks_n = self.decisions_n = 0
         self.last_stop = state_file.load()
         self.fault_sources: list[Callable[[float], tuple[DeviceFault, ...]]] = []
         self.on_tick: Callable[[], None] | None = None
@@ -146,9 +148,11 @@ class ControlLoop:
 
     def _step(self, commands: tuple[cmd.Command, ...], late_s: float = 0.0) -> tuple[cmd.Reply, ...]:
         before = self.tick.state
+        self.ticks_n += 1
         self.sensed = self._sensed(commands, late_s)
         self.tick = self.controller.step(self.sensed)
         self._act(self.tick)  # the wires come first, then whoever wants to know
+        self.decisions_n += self.tick.state.decision.decided_s > before.decision.decided_s
         self._note(before.mode, self.tick.state)
         if self.on_step is not None:
             self.on_step(self.sensed, self.tick)

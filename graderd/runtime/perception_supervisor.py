@@ -99,6 +99,7 @@ class PerceptionSupervisor:
         self._nonsense = PresentFaults("daemon")
         self._opens_without_frame_n = 0
         self._restarts_n = 0
+        self._frames_n = 0
         self._frame_times: deque[float] = deque(maxlen=30)
         self._previews: dict[PreviewFormat, asyncio.Future[Reading[bytes]]] = {}
         self._saved: asyncio.Future[Saved] | None = None
@@ -143,6 +144,7 @@ class PerceptionSupervisor:
         return CameraStatus(
             lifecycle=lifecycle,
             description=self._opened.description if self._opened else "",
+            frames_n=self._frames_n,
             restarts_n=self._restarts_n,
             recovery=recovery,
             settings_read_back=self._opened.settings_read_back if self._opened else {},
@@ -300,6 +302,7 @@ class PerceptionSupervisor:
                 raise ValueError(f"a frame of {observation.capture_s - self._last_word_s:.2f} s in the future")
             self._newest, self._taken = observation, False
             self._no_frame_since_s = self._last_word_s
+            self._frames_n += 1
             self._frame_times.append(self._newest.capture_s)
             self._problem = None
             self._opens_without_frame_n = 0

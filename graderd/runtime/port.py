@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncGenerator, Awaitable, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from typing import Any
 
 from pydantic import ValidationError
@@ -13,7 +13,7 @@ from graderd.api.port import ServiceError
 from graderd.config import Config
 from graderd.core.commands import Command, Reply, Stop
 from graderd.core.machine import Mode
-from graderd.core.status import Status
+from graderd.core.status import RecordingStatus, Status
 from graderd.hal.device import DeviceService, WatchBus
 from graderd.hal.errors import DeviceError
 from graderd.runtime.control import ControlLoop
@@ -38,11 +38,13 @@ class Port:
         devices: Devices,
         eyes: PerceptionSupervisor,
         services: Mapping[str, DeviceService],
+        recording: Callable[[], RecordingStatus] = RecordingStatus,
     ) -> None:
         self._config = config
         self._loop = loop
         self._devices = devices
         self._services = services
+        self._recording = recording
         self._eyes = eyes
         self._waiting: list[asyncio.Future[Status]] = []
         self._cached: Status | None = None
@@ -61,7 +63,7 @@ class Port:
     def status(self) -> Status:
         """The state at the last control tick."""
         if self._cached is None:
-            self._cached = build_status(self._config, self._loop, self._eyes)
+            self._cached = build_status(self._config, self._loop, self._eyes, self._recording())
         return self._cached
 
     async def next_status(self, after_s: float) -> Status:

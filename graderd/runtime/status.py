@@ -21,6 +21,7 @@ from graderd.core.status import (
     DecisionStatus,
     FaultStatus,
     LeaseStatus,
+    RecordingStatus,
     RequirementStatus,
     SoilStatus,
     Status,
@@ -40,9 +41,12 @@ VEHICLE_MAX_AGE_S = 1.0
 """How the machine drives is unknown when nobody has told it for so long."""
 VERSION = version("graderd")
 KNOWN_FOR_S = 5.0
+NOT_RECORDED = RecordingStatus()
 
 
-def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) -> Status:
+def build_status(
+    config: Config, loop: ControlLoop, eyes: PerceptionSupervisor, recording: RecordingStatus = NOT_RECORDED
+) -> Status:
     """The state at the last tick."""
     tick, sensed = loop.tick, loop.sensed
     now_s, state, decision = tick.now_s, tick.state, tick.state.decision
@@ -66,6 +70,7 @@ def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) 
             kept=decision.kept,
             since_m=decision.since_m,
             reason=decision.reason(now_s),
+            decisions_n=loop.decisions_n,
         ),
         vehicle=_vehicle(sensed.vehicle, now_s),
         axes={
@@ -93,9 +98,11 @@ def build_status(config: Config, loop: ControlLoop, eyes: PerceptionSupervisor) 
         camera=eyes.status(),
         tick=TickStatus(
             rate_hz=config.control.tick_hz,
+            ticks_n=loop.ticks_n,
             overruns_n=tick.overruns_n,
             lateness_p99_ms=lateness[int(0.99 * (len(lateness) - 1))] * 1e3 if lateness else 0.0,
         ),
+        recording=recording,
         presets=tuple(config.presets),
     )
 

@@ -10,14 +10,19 @@ import asyncio
 import contextlib
 import json
 import os
+import re
 import socket
 import sys
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import httpx
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
+from graderd.api.metrics import KINDS
 from graderd.client import RefusedError
 from graderd.core.machine import ARMED, Mode
 from graderd.simulator.control_client import RigControl
@@ -34,6 +39,9 @@ STILL_DEG = 0.3
 """The virtual servo's play about a goal that it holds."""
 AFTER_LEASE_S = 1.5
 """A hold brakes for less, and a lease is told by status for no longer than it lasts."""
+DASHBOARD = Path(__file__).parents[2] / "docs" / "integrators" / "grafana-dashboard.json"
+OF_THE_SCRAPE = {"instance", "job"}
+"""Labels that Prometheus itself adds."""
 SETTINGS = """
 [api.tcp]
 port_n = {port_n}
@@ -155,6 +163,35 @@ async def test_who_may_not_command_moves_nothing(described: Described) -> None:
     assert Mode.MANUAL in watch.modes
     assert watch.modes <= {Mode.MANUAL, Mode.DISARMED}
     assert watch.moved_deg < STILL_DEG
+
+
+async def test_the_dashboard_asks_for_what_is_there(described: Described) -> None:
+    """Every query's names and labels, against the metrics of this daemon."""
+    await described.machine.until(lambda s: s.soil.ahead is not None)
+    async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{described.port_n}", trust_env=False) as prometheus:
+        _, bearer = described.bearer(Right.READ)
+        text = (await prometheus.get("/metrics", headers=dict([bearer.split(": ", 1)]))).text
+    names, labels = set(), defaultdict(set)
+    for family in text_string_to_metric_families(text):
+        names |= {family.name + "_total" * (family.type == "counter")}
+        for sample in family.samples:
+            for label, value in sample.labels.items():
+                labels[sample.name, label].add(value)
+    panels = json.loads(DASHBOARD.read_text("utf-8"))["panels"]
+    queries = [target["expr"] for panel in panels for target in panel.get("targets", ())]
+    assert len(queries) > 30
+    for axis in ("axis_angle_degrees", "axis_extension_meters"):  # nothing is asked of a machine at rest
+        labels[f"graderd_{axis}", "kind"] |= set(KINDS)
+    for query in queries:
+        asked = re.findall(r"\b((?:graderd|process)_\w+)(?:\{([^}]*)\})?", query)
+        assert asked
+        for name, matchers in asked:
+            assert name in names, query
+            for label, values in re.findall(r'(\w+)=~?"([^"]*)"', matchers):
+                if label not in OF_THE_SCRAPE:
+                    assert set(values.split("|")) <= labels[name, label], query
+            for label in re.findall(r"by \((\w+)\)", query):
+                assert label in OF_THE_SCRAPE
 
 
 @pytest.mark.timeout(PATIENCE_S)

@@ -271,6 +271,7 @@ async def test_the_description_is_complete(tmp_path: Path) -> None:
         "/v1/jog",
         "/v1/bus/{name}",
         "/v1/session",
+        "/metrics",
     }
     for operations in paths.values():
         for operation in operations.values():

@@ -72,12 +72,13 @@ OF_THE_TICK = {
     "AxisStatus": {"requested", "limited", "arrived", "counters"},
     "AheadStatus": {"confidence"},
     "SoilStatus": {"confidence", "frames_per_s"},
-    "DecisionStatus": {"angle_deg", "kept", "since_m"},
+    "DecisionStatus": {"angle_deg", "kept", "since_m", "decisions_n"},
     "FaultStatus": {"present"},
     "RequirementStatus": {"met", "mandatory"},
     "LeaseStatus": {"remaining_s"},
-    "CameraStatus": {"restarts_n"},
-    "TickStatus": {"rate_hz", "overruns_n", "lateness_p99_ms"},
+    "CameraStatus": {"frames_n", "restarts_n"},
+    "TickStatus": {"rate_hz", "ticks_n", "overruns_n", "lateness_p99_ms"},
+    "RecordingStatus": {"run", "incident", "waiting_n", "lost_n"},
     "Status": {"time_s", "simulated", "arming", "stop_n"},
 }
 """What the daemon decided, counted or was told itself, and knows at ``time_s``."""

@@ -131,7 +131,7 @@ class Daemon:
         self._loop = ControlLoop(config, self._devices, self._eyes, clock, self._state_file)
         self._recorder = Recorder(config, self._loop.settings, self._loop.controller, self._eyes)
         services = build_services(config, self._devices, self._loop, self._eyes, self._recorder)
-        self._port = Port(config, self._loop, self._devices, self._eyes, services)
+        self._port = Port(config, self._loop, self._devices, self._eyes, services, self._recorder.status)
         self._health = HealthWatch(config)
         self._loop.fault_sources += [self._recorder.faults, self._health.faults]
         self._stop_input = build_stop_input(config, clock, on_stop=self._stop_from_input)

@@ -62,6 +62,8 @@ class _Loop:
     figures: Mapping[str, AxisFigures]
     lateness_s: deque[float]
     last_stop: None = None
+    ticks_n: int = 0
+    decisions_n: int = 0
 
 
 @dataclass(slots=True)
