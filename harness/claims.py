@@ -278,6 +278,14 @@ CLAIMS: Final = (
         "decisions follow each other without a pause",
     ),
     Mutant(
+        "F10-dwell-over-a-hold",
+        "graderd/core/rule.py",
+        "    return Decision(decided_s=decision.decided_s)\n",
+        "    return Decision()\n",
+        (TICK + "test_a_camera_that_comes_and_goes_lets_a_standing_blade_swing_no_more_often",),
+        "a camera that comes and goes lets the blade swing as often as it does",
+    ),
+    Mutant(
         "F10-votes",
         "graderd/core/rule.py",
         "if len(of) >= rule.votes_needed_n}",
@@ -312,10 +320,18 @@ CLAIMS: Final = (
     Mutant(
         "F13-stop-survives",
         "graderd/runtime/control.py",
-        "    if last_stop is None or last_stop.reset:\n",
+        "    if last_stop.reset:\n",
         "    if last_stop:\n",
         (CONTROL + "test_after_a_stop_and_a_restart_reset_comes_first",),
         "a restart does away with a stop",
+    ),
+    Mutant(
+        "F13-doubtful-is-stopped",
+        "graderd/runtime/state_file.py",
+        '            return _stop_now("what stopped it last could not be read")\n',
+        "            return None\n",
+        (PARTS + "test_a_damaged_state_file_is_kept_and_told_and_counts_as_a_stop_until_reset",),
+        "a restart does away with a stop whose record was damaged",
     ),
     Mutant(
         "F13-fresh-votes",
@@ -412,7 +428,7 @@ CLAIMS: Final = (
     Mutant(
         "I2-accepted",
         "graderd/core/tick.py",
-        "        if event is not None and state.mode is before.mode and state.arming_since_s is None:\n",
+        "        if event is not None and not _accepted(event, state):\n",
         "        if False:\n",
         (TICK + "test_a_latch_is_let_go_only_by_what_the_machine_accepts",),
         "what was latched is let go although the machine refused",
@@ -464,6 +480,22 @@ CLAIMS: Final = (
         "    others = ()\n",
         (MACHINE + "test_a_second_stops_reason_is_kept_beside_the_firsts_and_each_is_counted",),
         "a second stop hides why the first was",
+    ),
+    Mutant(
+        "I4-each-fault",
+        "graderd/core/machine.py",
+        "        new = fault.present and fault.name not in state.stopping\n",
+        "        new = fault.present and not state.stops\n",
+        (MACHINE + "test_a_fault_that_stops_is_a_stop_of_its_own_also_beside_and_after_another",),
+        "a fault that stops the machine once more is cleared by who has not seen it",
+    ),
+    Mutant(
+        "I4-counted-on",
+        "graderd/runtime/control.py",
+        "        return State(stop_n=last_stop.stop_n)\n",
+        "        return State()\n",
+        (CONTROL + "test_a_restart_knows_every_reason_and_counts_on",),
+        "a reset of a stop of yesterday clears one of today",
     ),
     Mutant(
         "I4-sent-once",

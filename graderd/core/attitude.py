@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from graderd.core.axes import Pose
 from graderd.hal.settings import Finite, NotNegative, Positive, Settings
@@ -24,7 +24,16 @@ class AttitudeGeometry(Settings):
     lift_raises_by_extending: bool = True
     lift_height_ratio: Positive = Field(1.0, description="mm of edge height for one mm of lift extension")
     tilt_level_mm: NotNegative = Field(50.0, description="extension of the tilt actuator with pitch 0")
-    tilt_deg_per_mm: Finite = Field(0.30, description="pitch for one mm; negative where extending leans it back")
+    tilt_deg_per_mm: Finite = Field(
+        0.30, ge=-10, le=10, description="pitch for one mm; negative where extending leans it back"
+    )
+
+    @field_validator("tilt_deg_per_mm")
+    @classmethod
+    def _tilts(cls, value: float) -> float:
+        if abs(value) < 1e-3:
+            raise ValueError("the tilt actuator must pitch the blade by 0.001 deg for one mm at least, or back")
+        return value
 
 
 class Preset(Settings):

@@ -73,12 +73,14 @@ class State:
 
     ``stop_n``: how many stops there were, each counted, also those that met a machine already stopped: a reset names
     the last one it knows of. ``stops``: the reasons of the stop that is latched, the first and the newest after it.
+    ``stopping``: the faults that ask for a stop now; each was counted when it came.
     """
 
     mode: Mode = Mode.DISARMED
     reason: str = "started disarmed"
     stop_n: int = 0
     stops: tuple[str, ...] = ()
+    stopping: frozenset[str] = frozenset()
     arming_since_s: float | None = None
     goals: Goals = field(default_factory=Goals)
     later: tuple[Goals, ...] = ()
@@ -167,13 +169,10 @@ def step(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSett
 
 def _react(state: State, inputs: Inputs) -> State:
     """The reactions of faults and lost devices; they come before any command."""
+    stopping = [f for f in inputs.faults if f.row.reaction is Reaction.STOP]
+    if stopping or state.mode is Mode.STOPPED:
+        return _react_stopping(state, stopping)
     fault = worst(inputs.faults)
-    if fault is not None and fault.row.reaction is Reaction.STOP:
-        why = f"{fault.name}: {fault.row.reads}"
-        known = state.mode is Mode.STOPPED and (why in state.stops or not fault.present)
-        return state if known else _stopped(state, why)
-    if state.mode is Mode.STOPPED:
-        return state
     if fault is not None and fault.row.reaction >= Reaction.DISARM:
         if state.mode is not Mode.DISARMED or state.arming_since_s is not None:
             return _disarmed(state, _own_standstill(inputs) or f"{fault.name}: {fault.row.reads}")
@@ -183,6 +182,17 @@ def _react(state: State, inputs: Inputs) -> State:
     if fault is not None and fault.row.reaction is Reaction.RETREAT and state.mode is Mode.AUTO:
         return _manual(state, f"{fault.name}: {fault.row.reads}")
     return state
+
+
+def _react_stopping(state: State, stopping: list[ActiveFault]) -> State:
+    """Each fault that comes is a stop of its own, also beside others and after them: who resets an earlier one has not
+    seen it. One that only its latch keeps says nothing new."""
+    for fault in stopping:
+        new = fault.present and fault.name not in state.stopping
+        if new or state.mode is not Mode.STOPPED:
+            state = _stopped(state, f"{fault.name}: {fault.row.reads}")
+    present = frozenset(f.name for f in stopping if f.present)
+    return state if present == state.stopping else replace(state, stopping=present)
 
 
 def _own_standstill(inputs: Inputs) -> str:
@@ -371,7 +381,8 @@ def _stopped(state: State, reason: str) -> State:
     """Latched. A further stop is counted and its reason kept beside the first's."""
     others = tuple(why for why in state.stops[:1] if why != reason)
     stops = (*others, reason)
-    return State(mode=Mode.STOPPED, reason="; also: ".join(stops), stop_n=state.stop_n + 1, stops=stops)
+    reason, stop_n = "; also: ".join(stops), state.stop_n + 1
+    return State(mode=Mode.STOPPED, reason=reason, stop_n=stop_n, stops=stops, stopping=state.stopping)
 
 
 def _disarmed(state: State, reason: str) -> State:

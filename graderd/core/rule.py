@@ -161,9 +161,12 @@ def decide(
 
 def interrupted(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel | None = None) -> Decision:
     """What a hold of the rotation leaves of a decision: no angle and no votes, for what moves afterwards was decided
-    afterwards; and the pass, in which nothing else is decided because a camera failed for a moment."""
+    afterwards; the pass, in which nothing else is decided because a camera failed for a moment; and when it was taken,
+    for a camera that comes and goes must not let the blade swing more often."""
     decision = _pass(replace(decision, votes=()), {}, now_s, rule, travel)
-    return replace(decision, angle_deg=None) if decision.kept and decision.begun else Decision()
+    if decision.kept and decision.begun:
+        return replace(decision, angle_deg=None)
+    return Decision(decided_s=decision.decided_s)
 
 
 def _reverses(travel: Travel | None, rule: RuleSettings) -> bool:

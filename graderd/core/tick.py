@@ -198,8 +198,8 @@ class Controller:
             settings.rule,
         )
         self._state = state = result.state
-        if event is not None and state.mode is before.mode and state.arming_since_s is None:
-            self._faults = latched  # refused: what was latched stays
+        if event is not None and not _accepted(event, state):
+            self._faults = latched
         if state.mode in ARMED and before.mode not in ARMED:
             self._gate = GateState()
             self._faults = clear_faults(self._faults, Clear.ON_REARM)
@@ -330,6 +330,11 @@ def _unlatching(state: State, commands: tuple[cmd.AnyCommand, ...]) -> Clear | N
     if state.mode is Mode.DISARMED and any(isinstance(command, cmd.Arm) for command in commands):
         return Clear.ON_REARM
     return None
+
+
+def _accepted(event: Clear, state: State) -> bool:
+    """Whether the machine did what lets go of latches; a stop or a fault of the same moment may have been before it."""
+    return state.mode is not Mode.STOPPED if event is Clear.ON_RESET else state.arming_since_s is not None
 
 
 def _pose_of(sensed: Sensed, figures: Mapping[str, AxisFigures]) -> Pose:

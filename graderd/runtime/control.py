@@ -23,6 +23,7 @@ from graderd.runtime.state_file import LastStop, StateFile
 
 MAX_COMMANDS_PER_TICK = 32
 LATENESS_WINDOW_N = 500
+BEFORE = "stopped before the daemon was started"
 STOP_REMEDY = "read its reason, reset that stop, then ask again"
 
 log = logging.getLogger(__name__)
@@ -45,11 +46,13 @@ class Eyes(Protocol):
 
 
 def _state_at_start(last_stop: LastStop | None) -> State:
-    """Stopped, where nobody has let go of what stopped the machine before it was started anew."""
-    if last_stop is None or last_stop.reset:
+    """Stopped, where nobody has let go of what stopped the machine before it was started anew. Stops are counted on."""
+    if last_stop is None:
         return State()
-    reason = f"stopped before the daemon was started: {last_stop}"
-    return State(mode=Mode.STOPPED, reason=reason, stop_n=1, stops=(reason,))
+    if last_stop.reset:
+        return State(stop_n=last_stop.stop_n)
+    reason = last_stop.reason if BEFORE in last_stop.reason else f"{BEFORE}: {last_stop}"
+    return State(mode=Mode.STOPPED, reason=reason, stop_n=max(1, last_stop.stop_n), stops=(reason,))
 
 
 class ControlLoop:
@@ -153,19 +156,20 @@ class ControlLoop:
         self.tick = self.controller.step(self.sensed)
         self._act(self.tick)  # the wires come first, then whoever wants to know
         self.decisions_n += self.tick.state.decision.decided_s > before.decision.decided_s
-        self._note(before.mode, self.tick.state)
+        self._note(before, self.tick.state)
         if self.on_step is not None:
             self.on_step(self.sensed, self.tick)
         return self.tick.replies
 
-    def _note(self, before: Mode, after: State) -> None:
-        if before is after.mode:
-            return
-        if after.mode is Mode.STOPPED and not self._keep_last_stop:
-            self.last_stop = self._state_file.save(after.reason)
-        elif before is Mode.STOPPED and self.last_stop is not None:
-            self.last_stop = self._state_file.save_reset(self.last_stop)
-        self._tell_transition(before, after)
+    def _note(self, before: State, after: State) -> None:
+        if after.mode is Mode.STOPPED:
+            # A second reason as well as the first: who starts the daemon anew has to know both.
+            if after.stops != before.stops and not self._keep_last_stop:
+                self.last_stop = self._state_file.save(after.reason, after.stop_n)
+        elif before.mode is Mode.STOPPED and self.last_stop is not None:
+            self.last_stop = self._state_file.save_reset(self.last_stop, before.stop_n)
+        if before.mode is not after.mode:
+            self._tell_transition(before.mode, after)
 
     def _tell_transition(self, before: Mode, after: State) -> None:
         """Who or what changed the mode stands in fields of its own beside the text."""

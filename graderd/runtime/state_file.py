@@ -5,9 +5,12 @@ Written atomically, checked when read. A thread writes: a disk that stalls must 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import shutil
 import threading
+import time
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -15,19 +18,27 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 WRITE_MOST_S = 1.0
 """At its end the daemon waits so long for the last write."""
+STALLED_S = 0.5
+"""A write that takes longer is told: it takes some milliseconds."""
 
 
 class LastStop(BaseModel):
-    """The newest latched stop. ``reset``: a person has let go of it."""
+    """The newest latched stop. ``reset``: a person has let go of it. ``stop_n``: its number; the count goes on from it
+    after a restart, or a reset that was read of another day's stop would clear one of today's."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     reason: str
     wall_time: str
     reset: bool = False
+    stop_n: int = 0
 
     def __str__(self) -> str:
         return f"{self.reason} ({self.wall_time})"
+
+
+def _stop_now(reason: str, stop_n: int = 0) -> LastStop:
+    return LastStop(reason=reason, wall_time=datetime.now(UTC).isoformat(timespec="seconds"), stop_n=stop_n)
 
 
 class StateFile:
@@ -36,59 +47,66 @@ class StateFile:
     def __init__(self, directory: str = "") -> None:
         directory = directory or os.environ.get("STATE_DIRECTORY", "")
         self._path = Path(directory) / "last_stop.json" if directory else None
-        self.problem = ""
-        """Why the file could not be read or written; empty if all is well."""
+        self._problem = ""
         self._to_write: LastStop | None = None
-        self._writing = False
+        self._writing_since_s: float | None = None
         self._changed = threading.Condition()
 
+    @property
+    def problem(self) -> str:
+        """Why the file could not be read or written, or is not written yet; empty if all is well."""
+        since_s = self._writing_since_s
+        stalled = since_s is not None and time.monotonic() - since_s > STALLED_S
+        return self._problem or (f"{self._path}: the disk takes long to write" if stalled else "")
+
     def load(self) -> LastStop | None:
-        """The last stop, or None. A damaged file is kept aside under ``.damaged`` and told in :attr:`problem`."""
-        if self._path is None or not self._path.exists():
+        """The last stop, or None. A file that cannot be read is told in :attr:`problem`, and counts as a stop that
+        nobody has reset: there may have been one. A copy is kept under ``.damaged``; it stays itself until there is
+        another to write."""
+        if self._path is None:
             return None
         try:
             return LastStop.model_validate_json(self._path.read_bytes())
-        except (OSError, ValidationError) as error:
-            self.problem = f"{self._path}: {str(error).splitlines()[0]}"
-            try:
-                self._path.replace(self._path.with_suffix(".damaged"))
-            except OSError:
-                self.problem += " (and cannot be set aside)"
+        except (FileNotFoundError, NotADirectoryError):
             return None
+        except (OSError, ValidationError) as error:
+            self._problem = f"{self._path}: {str(error).splitlines()[0]}"
+            with contextlib.suppress(OSError):
+                shutil.copyfile(self._path, self._path.with_suffix(".damaged"))
+            return _stop_now("what stopped it last could not be read")
 
-    def save(self, reason: str) -> LastStop:
+    def save(self, reason: str, stop_n: int) -> LastStop:
         """Have the reason of a stop written; a disk that is full or stalls is told in :attr:`problem`, never waited
         for and never raised into the control loop."""
-        stop = LastStop(reason=reason, wall_time=datetime.now(UTC).isoformat(timespec="seconds"))
+        stop = _stop_now(reason, stop_n)
         self._write_soon(stop)
         return stop
 
-    def save_reset(self, stop: LastStop) -> LastStop:
-        """Have it written that a person has let go of this stop."""
-        stop = stop.model_copy(update={"reset": True})
+    def save_reset(self, stop: LastStop, stop_n: int) -> LastStop:
+        """Have it written that a person has let go of this stop, and of its repetitions up to ``stop_n``."""
+        stop = stop.model_copy(update={"reset": True, "stop_n": stop_n})
         self._write_soon(stop)
         return stop
 
     def settle(self, most_s: float = WRITE_MOST_S) -> bool:
         """Wait until everything is written, not longer than ``most_s``, and say whether it is."""
         with self._changed:
-            return self._changed.wait_for(lambda: not self._writing, most_s)
+            return self._changed.wait_for(lambda: self._writing_since_s is None, most_s)
 
     def _write_soon(self, stop: LastStop) -> None:
         if self._path is None:
             return
         with self._changed:
             self._to_write = stop
-            if self._writing:
-                self.problem = self.problem or f"{self._path}: the disk takes long to write"
+            if self._writing_since_s is not None:
                 return
-            self._writing = True
+            self._writing_since_s = time.monotonic()
         # Not one of a pool: a pool waits for its threads at the end of the process.
         try:
             threading.Thread(target=self._write_all, args=(self._path,), name="state-file", daemon=True).start()
         except RuntimeError as error:  # no more threads
-            self._writing = False
-            self.problem = f"{self._path}: {error}"
+            self._writing_since_s = None
+            self._problem = f"{self._path}: {error}"
 
     def _write_all(self, path: Path) -> None:
         """Write the newest until there is nothing newer."""
@@ -96,7 +114,7 @@ class StateFile:
             with self._changed:
                 stop, self._to_write = self._to_write, None
                 if stop is None:
-                    self._writing = False
+                    self._writing_since_s = None
                     self._changed.notify_all()
                     return
             temporary = path.with_suffix(".new")
@@ -104,6 +122,6 @@ class StateFile:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 temporary.write_text(json.dumps(stop.model_dump()), encoding="utf-8")
                 temporary.replace(path)
-                self.problem = ""
+                self._problem = ""
             except OSError as error:
-                self.problem = f"{path}: {error.strerror}"
+                self._problem = f"{path}: {error.strerror}"

@@ -190,3 +190,9 @@ def test_whatever_it_is_shown_its_commands_are_in_range(steps: list[tuple[float,
         for side in (command.left, command.right):
             assert 0.0 < side.speed_share <= 1.0
             assert side.target_mm is None or abs(side.target_mm) < 1e6
+
+
+@pytest.mark.parametrize("nothing", [0.0, -1e-300, 1e300])
+def test_a_tilt_that_pitches_nothing_or_anything_is_refused_before_a_jog_divides_by_it(nothing: float) -> None:
+    with pytest.raises(ValidationError, match="tilt_deg_per_mm"):
+        AttitudeGeometry(tilt_deg_per_mm=nothing)

@@ -168,6 +168,27 @@ def test_a_second_stops_reason_is_kept_beside_the_firsts_and_each_is_counted() -
     assert do(failed, faults=(fault(Reaction.STOP),)).state == failed
 
 
+def test_a_fault_that_stops_is_a_stop_of_its_own_also_beside_and_after_another() -> None:
+    first, second = (replace(f, name=f"rotation.{n}") for n, f in zip("ab", [fault(Reaction.STOP)] * 2, strict=True))
+    state = do(AUTO, faults=(first,), devices_active=True).state
+    seen_n = state.stop_n
+    for both in ((first, second), (replace(first, present=False), second)):
+        state = do(state, faults=both).state
+        assert (state.stop_n, state.reason.count("rotation.b")) == (seen_n + 1, 1)
+    gone = tuple(replace(f, present=False) for f in (first, second))
+    late = do(state, cmd.Reset(stop_n=seen_n), faults=gone)
+    assert not late.replies[0].accepted
+    assert "rotation.b" in late.replies[0].message
+    again = do(late.state, faults=(first, gone[1])).state
+    assert again.stop_n == seen_n + 2
+    for _ in range(3):  # neither one that stands, nor another stop beside it, counts it anew
+        again = do(again, faults=(first, gone[1])).state
+    beside = do(again, cmd.Stop(reason="child"), faults=(first, gone[1])).state
+    assert do(beside, faults=(first, gone[1])).state == beside
+    assert beside.stop_n == seen_n + 3
+    assert do(beside, cmd.Reset(stop_n=beside.stop_n), faults=gone).state.mode is Mode.DISARMED
+
+
 def test_a_reset_clears_the_stop_it_names_and_none_that_came_after() -> None:
     first = do(AUTO, cmd.Stop(reason="dog on the site"), devices_active=True).state
     second = do(first, cmd.Stop(reason="child on the site")).state
@@ -352,7 +373,8 @@ def test_a_hold_before_the_pass_leaves_all_open() -> None:
     standing = Travel(0.0, 0.0)
     turning = replace(AUTO, decision=Decision(Zone.LEFT, 30.0, NOW_S - 5.0, at_m=0.0, since_m=0.0))
     after = do(turning, devices_active=True, held={"rotation": "it is far"}, travel=standing).state
-    assert after.decision == Decision()
+    # But when it was taken: a camera that comes and goes does not let the blade swing more often.
+    assert after.decision == Decision(decided_s=turning.decision.decided_s)
 
 
 def test_a_preset_that_stands_short_of_a_stage_ends() -> None:

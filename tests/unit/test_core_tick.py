@@ -13,6 +13,7 @@ import math
 from collections import Counter
 from dataclasses import asdict, is_dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -164,7 +165,12 @@ def test_a_latch_is_let_go_only_by_what_the_machine_accepts() -> None:
     refused = controller.step(Sensed(5.1, unmeasured, commands=(cmd.Arm(),)))
     assert not refused.replies[0].accepted
     assert refused.faults
-    assert not controller.step(Sensed(5.2, off(5.2), commands=(cmd.Arm(),))).faults
+    shot = (DeviceFault("rotation", "overspeed", "", 5.15),)  # in the very tick that would arm
+    stopped = controller.step(Sensed(5.15, off(5.15), faults=shot, commands=(cmd.Arm(),)))
+    assert not stopped.replies[0].accepted
+    assert len(stopped.faults) == 2
+    named = cmd.Reset(stop_n=stopped.state.stop_n)
+    assert not controller.step(Sensed(5.2, off(5.2), commands=(named,))).faults
 
 
 @pytest.mark.parametrize("mode", [Mode.AUTO, Mode.MANUAL])
@@ -223,6 +229,33 @@ def test_no_fault_that_goes_lets_motion_go_on_without_a_fresh_decision_or_a_comm
         assert tick.state.mode is not Mode.AUTO
         if mode is Mode.AUTO:
             assert row.reads in tick.state.reason
+
+
+def test_a_camera_that_comes_and_goes_lets_a_standing_blade_swing_no_more_often() -> None:
+    controller, at, goals, decided = Controller(SETTINGS), dict(HOME), dict[str, float](), list[tuple[float, Zone]]()
+    commands: dict[int, tuple[cmd.AnyCommand, ...]] = {0: (cmd.Arm(),), 2: (cmd.Auto(),)}
+    for number in range(400):
+        now_s = 100.0 + TICK_S * number
+        zone = Zone.CENTER if number // 40 % 2 else Zone.LEFT
+        shares = (0.05, 0.9) if number // 40 % 2 else (0.9, 0.05)
+        tick = controller.step(
+            Sensed(
+                now_s,
+                standing(now_s, at, Lifecycle.ACTIVE if number else Lifecycle.STANDBY, goals),
+                faults=(DeviceFault("camera", "stale", "", now_s),) if number % 40 == 0 else (),
+                commands=commands.get(number, ()),
+                observation=SoilObservation(now_s, zone, 0.9, "", *shares, 0.05, frame_number=number),
+                powered=number > 0,
+                vehicle=VehicleTelemetry(Reading(0.0, now_s), Reading(7.0, now_s)),
+            )
+        )
+        turning = tick.axes["rotation"]
+        goals = {"rotation": turning.send} if turning.send is not None else {} if turning.hold else goals
+        at["rotation"] += max(-0.5, min(goals.get("rotation", at["rotation"]) - at["rotation"], 0.5))
+        if (found := tick.state.decision.zone) is not None and (not decided or found is not decided[-1][1]):
+            decided.append((now_s, found))
+    assert len(decided) > 1
+    assert all(b - a >= SETTINGS.rule.dwell_s for (a, _), (b, _) in pairwise(decided))
 
 
 async def test_a_stop_makes_void_what_was_asked_before_it(tmp_path: Path) -> None:

@@ -156,6 +156,28 @@ async def test_after_a_stop_and_a_restart_reset_comes_first(bench: Bench, tmp_pa
     assert Bench(tmp_path).loop.tick.state.mode is Mode.DISARMED
 
 
+async def test_a_restart_knows_every_reason_and_counts_on(bench: Bench, tmp_path: Path) -> None:
+    for reason in ("dog on the site", "dog on the site", "child on the site"):
+        bench.loop.stop_now(cmd.Stop(reason=reason))
+    assert bench.state_file.settle()
+    again = Bench(tmp_path)
+    assert again.loop.tick.state.stop_n == 3
+    assert "dog on the site; also: child on the site" in again.loop.tick.state.reason
+    again.loop.stop_now(cmd.Stop(reason="man on the site"))
+    again.loop.stop_now(cmd.Stop(reason="man on the site"))
+    assert again.state_file.settle()
+    third = Bench(tmp_path)
+    assert third.loop.tick.state.reason.count("before the daemon was started") == 1
+    assert (await again.do(cmd.Reset(stop_n=5))).accepted
+    assert again.state_file.settle()
+    # Who read the number of a stop of yesterday clears none of today's.
+    today = Bench(tmp_path)
+    today.loop.stop_now(cmd.Stop(reason="boar on the site"))
+    assert not (await today.do(cmd.Reset(stop_n=1))).accepted
+    assert (await today.do(cmd.Reset(stop_n=6))).accepted
+    assert today.state_file.settle()
+
+
 async def test_after_a_freeze_the_reason_is_the_freeze(bench: Bench) -> None:
     await bench.arm()
     bench.machine.clock.advance(1.5)
@@ -170,7 +192,7 @@ async def test_the_wires_come_before_the_log_and_the_state_file(bench: Bench, mo
     await bench.arm()
     order = bench.machine.log
     order.clear()
-    monkeypatch.setattr(bench.state_file, "save", lambda reason: order.append(f"state file: {reason}"))
+    monkeypatch.setattr(bench.state_file, "save", lambda reason, _: order.append(f"state file: {reason}"))
     monkeypatch.setattr(control_log, "info", lambda *_, **__: order.append("log"))
     bench.loop.stop_now(cmd.Stop(reason="test"))
     assert [line for line in order if "hold" not in line] == ["state file: test", "log"]

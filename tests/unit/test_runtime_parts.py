@@ -13,6 +13,7 @@ from graderd.config import Config, parse
 from graderd.core.machine import Mode
 from graderd.core.soil import Zone
 from graderd.core.status import CameraStatus, Status
+from graderd.runtime import state_file
 from graderd.runtime.app.perception_child import AngleHistory, settings_not_kept
 from graderd.runtime.health import HealthWatch
 from graderd.runtime.sd_notify import SystemdNotifier
@@ -27,7 +28,7 @@ STATUS = Status(
 
 def test_the_last_stop_survives_a_restart(tmp_path: Path) -> None:
     state = StateFile(str(tmp_path / "new"))
-    state.save("dog on the site")
+    state.save("dog on the site", 1)
     assert state.settle()
     found = StateFile(str(tmp_path / "new")).load()
     assert found is not None
@@ -38,40 +39,58 @@ def test_the_last_stop_survives_a_restart(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"{", b'{"reason": 1}', b"\xff", b'{"reason": "x", "wall_time": "y", "z": 1}']
 )
-def test_a_damaged_state_file_is_set_aside_and_told(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "last_stop.json"
-    path.write_bytes(content)
-    state = StateFile(str(tmp_path))
-    assert state.load() is None
-    assert "last_stop.json" in state.problem
+def test_a_damaged_state_file_is_kept_and_told_and_counts_as_a_stop_until_reset(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "last_stop.json").write_bytes(content)
+    for _ in range(2):  # a second start is no reset
+        state = StateFile(str(tmp_path))
+        last = state.load()
+        assert last is not None
+        assert not last.reset
+        assert "last_stop.json" in state.problem
+    assert last is not None
     assert (tmp_path / "last_stop.damaged").read_bytes() == content
-    assert not path.exists()
-    state.save("next")
+    state.save_reset(last, 1)
     assert state.settle()
     assert state.problem == ""
+    found = StateFile(str(tmp_path)).load()
+    assert found is not None
+    assert found.reset
+
+
+def test_a_state_file_that_may_not_be_read_counts_as_a_stop(tmp_path: Path) -> None:
+    (tmp_path / "last_stop.json").mkdir()
+    state = StateFile(str(tmp_path))
+    last = state.load()
+    assert last is not None
+    assert not last.reset
+    assert "last_stop.json" in state.problem
 
 
 def test_a_state_directory_that_cannot_be_written_is_told_and_raises_nothing(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
     state = StateFile(str(tmp_path / "file" / "state"))
-    assert state.save("x").reason == "x"
+    assert state.save("x", 1).reason == "x"
     assert state.settle()
     assert state.problem
 
 
-def test_a_state_directory_that_stalls_is_not_waited_for_and_told(tmp_path: Path) -> None:
+def test_a_state_directory_that_stalls_is_not_waited_for_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     os.mkfifo(tmp_path / "last_stop.new")  # a file whose opening hangs, as on a disk that does not answer
     state = StateFile(str(tmp_path))
     began_s = time.monotonic()
-    for reason in ("one", "two", "three"):
-        assert state.save(reason).reason == reason
+    for number, reason in enumerate(("one", "two", "three")):
+        assert state.save(reason, number).reason == reason
     assert time.monotonic() - began_s < 5.0  # who waits for the disk waits for ever
     assert not state.settle(0.05)
+    assert state.problem == ""  # two stops within a moment are no fault of the disk
+    monkeypatch.setattr(state_file, "STALLED_S", 0.0)
     assert "takes long" in state.problem
     with (tmp_path / "last_stop.new").open("rb"):  # the disk is back
         assert state.settle()
     assert state.problem == ""
-    state.save("four")
+    state.save("four", 4)
     assert state.settle()
     last = state.load()
     assert last is not None

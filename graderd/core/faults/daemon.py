@@ -44,7 +44,7 @@ ROWS = (
         "daemon.state_file_corrupt",
         "what the daemon remembered from its last run could not be read",
         "a power cut while writing, or a faulty disk",
-        "the last stop's reason is lost; check the disk if it happens again",
+        "the last stop's reason is lost, and the machine starts stopped: reset; check the disk if it happens again",
         Reaction.WARN,
     ),
     FaultRow(
