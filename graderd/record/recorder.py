@@ -76,6 +76,9 @@ FLUSH_S = 0.5
 GIVE_WAY_S = 0.0003
 """The thread rests so long after each value: who waits for the interpreter has it meanwhile."""
 ENDING_S = 2.0
+"""What is there is written within this, or is lost: a disk that hangs does not keep the daemon alive."""
+STALLED_S = 5.0
+"""A thread that has not come round for so long waits for the disk."""
 FAULT_SHOWN_S = 5.0
 
 log = logging.getLogger(__name__)
@@ -120,6 +123,8 @@ class Recorder:
         self._lines: dict[str, deque[str]] = {}
         self._lost_n = self._lost_ever_n = 0
         self._memory_due_s = self._wires_due_s = -math.inf
+        self._thread_ended = asyncio.Event()
+        self._thread_ended.set()
 
     @property
     def directory(self) -> Path | None:
@@ -177,7 +182,18 @@ class Recorder:
 
     def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """Why nothing is written now."""
-        return () if self._writer is None else self._writer.faults.present(now_s)
+        if self._writer is None:
+            return ()
+        return (*self._writer.faults.present(now_s), *self._stalled(now_s))
+
+    def _stalled(self, now_s: float) -> tuple[DeviceFault, ...]:
+        """What the thread cannot tell: that it hangs, in a call that the disk does not answer."""
+        assert self._writer is not None
+        since_s = self._writer.came_round_s
+        if since_s is None or now_s - since_s <= STALLED_S or self._thread_ended.is_set():
+            return ()
+        detail = f"{self._writer.store.directory}: the disk has not answered for {now_s - since_s:.0f} s"
+        return (DeviceFault("daemon", "recorder_failed", detail, since_s + STALLED_S),)
 
     def status(self) -> RecordingStatus:
         """For people; what the thread has open may be a moment old."""
@@ -189,22 +205,32 @@ class Recorder:
     # ---- what goes out --------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Write until cancelled; what is there is written on the way out."""
+        """Write until cancelled; what is there is written on the way out. The event loop never waits for the disk."""
         if self._writer is None:
             log.info("nothing is recorded: recording.directory is empty, and there is no state directory")
             return
-        loop = asyncio.get_running_loop()
+        await self._thread_ended.wait()  # of a run before that failed: the files are one thread's
+        self._thread_ended.clear()
         ending = threading.Event()
-        frames = _from_thread(loop, self._eyes.record_frames)
-        thread = threading.Thread(
-            target=self._writer.work, args=(self._queue, ending, frames), name="recorder", daemon=True
-        )
-        thread.start()
+        own = (asyncio.get_running_loop(), ending)
+        threading.Thread(target=self._write, args=own, name="recorder", daemon=True).start()
         try:
             await self._ask_for_pictures()
         finally:
             ending.set()
-            thread.join(ENDING_S)
+            try:
+                async with asyncio.timeout(ENDING_S):
+                    await self._thread_ended.wait()
+            except TimeoutError:
+                log.error("recording: the disk does not answer; what was not written yet is lost")
+
+    def _write(self, loop: asyncio.AbstractEventLoop, ending: threading.Event) -> None:
+        """Body of the thread."""
+        assert self._writer is not None
+        try:
+            self._writer.work(self._queue, ending, _from_thread(loop, self._eyes.record_frames))
+        finally:
+            _from_thread(loop, self._thread_ended.set)()
 
     async def _ask_for_pictures(self) -> None:
         pictures_hz = self._config.recording.pictures_hz
@@ -220,13 +246,13 @@ class Recorder:
                 self._queue.append(picture)
 
 
-def _from_thread(
-    loop: asyncio.AbstractEventLoop, call: Callable[[FramesWanted], None]
-) -> Callable[[FramesWanted], None]:
-    def soon(wanted: FramesWanted) -> None:
+def _from_thread(loop: asyncio.AbstractEventLoop, call: Callable[..., None]) -> Callable[..., None]:
+    """The same on the event loop, for a thread to call."""
+
+    def soon(*values: object) -> None:
         try:
-            loop.call_soon_threadsafe(call, wanted)
-        except RuntimeError:  # the loop is closed: the child is gone with it
+            loop.call_soon_threadsafe(call, *values)
+        except RuntimeError:  # the loop is closed, and with it went whom it would tell
             return
 
     return soon
@@ -243,6 +269,7 @@ class _Files:
     """The thread's side: what is taken becomes messages, goes through the ring and into the files that are open.
 
     ``wanted``, ``now_s`` and ``incidents.expect_stop`` are told by the event loop; everything else is the thread's.
+    ``came_round_s``: the tick at which the thread was last seen to wait for nothing; None: it has not begun.
     """
 
     def __init__(self, config: Config, store: Store) -> None:
@@ -252,6 +279,7 @@ class _Files:
         self.faults = PresentFaults("daemon")
         self.incidents = IncidentWatch()
         self.now_s = 0.0
+        self.came_round_s: float | None = None
         self._config_json = config.model_dump_json().encode()
         for topic in (SENSED, TICK, MEMORY):  # made once, now: it would hold up ticks later
             schema_of(topic)
@@ -281,6 +309,7 @@ class _Files:
         self._tell_frames = tell_frames
         due_s = 0.0
         while not ending.wait(DRAIN_S):
+            self.came_round_s = self.now_s or None  # 0: no tick has come yet
             # Whatever still comes in, what is there is written out in time.
             while queue and time.monotonic() < due_s:
                 self.put(queue.popleft())

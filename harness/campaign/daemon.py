@@ -1,7 +1,8 @@
 """The daemon with handles for what cannot be done to a process from outside: ``python -m harness.campaign.daemon``.
 
 Nothing of the product knows of this. On SIGUSR1 the process does what ``hook.json`` in its rig's directory says:
-``block_s`` stops the event loop, ``clock_step_s`` shows the daemon a stepped wall clock, ``memory_mb`` takes memory.
+``block_s`` stops the event loop, ``clock_step_s`` shows the daemon a stepped wall clock, ``memory_mb`` takes memory,
+``disk_full`` says that no space is left, ``disk_stalled`` has no write to a recording answered.
 ``GRADERD_CAMPAIGN_BREAK`` spoils one safety reaction, to prove that the campaign notices (see ``BREAKS``).
 """
 
@@ -63,6 +64,7 @@ class Hooks:
         self._kept: list[bytearray] = []
         self._time = time.time
         self._disk_usage = shutil.disk_usage
+        self._write = os.write
         self._step_s = 0.0
 
     def on_signal(self, _: int, __: FrameType | None) -> None:
@@ -78,8 +80,16 @@ class Hooks:
             usage = self._disk_usage
             # Less than nothing: below any limit that may be configured, 0 included.
             shutil.disk_usage = (lambda path: usage(path)._replace(free=-1)) if wanted["disk_full"] else usage
+        if "disk_stalled" in wanted:
+            os.write = self._hang if wanted["disk_stalled"] else self._write
         if "memory_mb" in wanted:
             threading.Thread(target=self._take_memory, args=(int(wanted["memory_mb"]),), daemon=True).start()
+
+    def _hang(self, file: int, data: bytes) -> int:
+        """As a system call that waits for a disk: it ends with the process, or with the disk's answer."""
+        while threading.current_thread().name == "recorder" and os.write == self._hang:
+            time.sleep(0.05)
+        return self._write(file, data)
 
     def _take_memory(self, wanted_mb: int) -> None:
         """Little by little beside the event loop, as a leak does."""

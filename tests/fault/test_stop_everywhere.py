@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from graderd.record.recorder import ENDING_S
 from harness.campaign.conduct import EVERYTHING, come_to
 from harness.campaign.model import Phase
 from harness.campaign.stack import Stack
@@ -69,6 +70,9 @@ async def test_stop_comes_from_everywhere_latches_and_reaches_both_wires_at_once
         assert stack.watch.standstill_s(EVERYTHING, asked_s) < STILL_S
         assert stack.new_log_errors() == []
 
+        await stack.start_daemon()
+        await _stop_while_the_disk_hangs(stack)
+
 
 @asynccontextmanager
 async def flooded(stack: Stack) -> AsyncIterator[None]:
@@ -85,6 +89,29 @@ async def flooded(stack: Stack) -> AsyncIterator[None]:
     finally:
         said, _ = await flood.communicate()
     assert float(json.loads(said)["sent_per_s"]) > 1000.0 or stack.daemon.returncode is not None
+
+
+async def _stop_while_the_disk_hangs(stack: Stack) -> None:
+    """The recorder's thread waits for it in the kernel: ticks, stop and the end of the service do not."""
+    assert (await stack.command("reset"))["accepted"]
+    stack.hook(disk_stalled=1)
+    status = await stack.until_status(
+        lambda s: any(fault["name"] == "daemon.recorder_failed" for fault in s["faults"]), 20.0, "a hung disk not told"
+    )
+    assert not any(fault["name"] == "daemon.loop_blocked" for fault in status["faults"])
+    found = await stopped_in_motion(stack, Phase.TURNING, by_stop_request)
+    assert found["servo_s"] < WIRES_S, found
+    assert found["still_s"] < STILL_S, found
+    assert (await stack.command("reset"))["accepted"]
+    await come_to(stack, Phase.TURNING)
+    asked_s = time.monotonic()
+    stack.daemon.send_signal(signal.SIGTERM)
+    async with asyncio.timeout(END_S + ENDING_S):
+        assert await stack.daemon.wait() == 0
+    assert await stack.watch.until_still(EVERYTHING, 0.3, 4.0)
+    assert stack.watch.newest().state["servo_goal_written_s"] - asked_s < WIRES_S
+    assert stack.watch.standstill_s(EVERYTHING, asked_s) < STILL_S
+    assert [line for line in stack.new_log_errors() if "the disk does not answer" not in line] == []
 
 
 async def _stop_under_flood(stack: Stack) -> None:

@@ -10,10 +10,13 @@ import math
 import os
 import pickle
 import shutil
+import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock
 
 import jsonschema
 import numpy as np
@@ -528,6 +531,69 @@ async def test_the_recorder_writes_by_itself_and_ends_in_order(tmp_path: Path) -
     (path,) = work.paths("run")
     assert len(list(Recording(path).messages((TICK,)))) == len(TICKS)
     assert Recording(path).extent.is_ended
+
+
+class StalledDisk:
+    """A disk that answers no write until it is let go."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.reached, self.released = threading.Event(), threading.Event()
+        self._write = os.write
+        monkeypatch.setattr(os, "write", self._hang)
+
+    def _hang(self, file: int, data: bytes) -> int:
+        if threading.current_thread().name == "recorder":
+            self.reached.set()
+            self.released.wait()
+        return self._write(file, data)
+
+
+async def test_a_disk_that_hangs_holds_up_neither_the_ticks_nor_the_end_and_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "ENDING_S", 0.3)
+    work = Work(tmp_path)
+    work.recorder.take(WORK[0], TICKS[0])
+    disk = StalledDisk(monkeypatch)
+    task = asyncio.create_task(work.recorder.run())
+    assert await asyncio.to_thread(disk.reached.wait, 10.0)
+    at_s = TICKS[0].now_s
+    assert work.recorder.faults(at_s + 4.0) == ()
+    (fault,) = work.recorder.faults(at_s + 6.0)
+    assert fault.name == "daemon.recorder_failed"
+    assert "has not answered for 6 s" in fault.detail
+    task.cancel()
+    turns_n, most_s, before_s = 0, 0.0, time.monotonic()
+    while not task.done():
+        await asyncio.sleep(0.005)
+        now_s = time.monotonic()
+        turns_n, most_s, before_s = turns_n + 1, max(most_s, now_s - before_s), now_s
+    assert most_s < 0.2, "the event loop went on while the disk was waited for"
+    assert turns_n > 5
+    disk.released.set()
+    async with asyncio.timeout(10.0):
+        await work.recorder._thread_ended.wait()
+    assert work.recorder.faults(at_s + 6.0) == ()
+
+
+async def test_a_recorder_that_is_started_again_writes_with_one_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "ENDING_S", 0.05)
+    work = Work(tmp_path, pictures_hz=10)
+    work.recorder.take(WORK[0], TICKS[0])
+    disk = StalledDisk(monkeypatch)
+    pictures = AsyncMock(side_effect=ValueError("no such picture"))
+    monkeypatch.setattr(work.eyes, "preview_jpeg", pictures)
+    with pytest.raises(ValueError, match="no such picture"):
+        await work.recorder.run()
+    again = asyncio.create_task(work.recorder.run())
+    await asyncio.to_thread(disk.reached.wait, 10.0)
+    assert pictures.await_count == 1, "the first thread still has the files"
+    disk.released.set()
+    with pytest.raises(ValueError, match="no such picture"):
+        await again
+    assert all(Recording(path).extent.is_ended for path in work.paths("run"))
 
 
 async def test_without_a_directory_nothing_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
