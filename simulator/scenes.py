@@ -171,9 +171,9 @@ def _press(rng: np.random.Generator, field: SoilField, blade: BladePose) -> None
         start_m = _VEHICLE_X_M - travel_m
         for step in range(15):
             here, there = (start_m + travel_m * share / 15.0 for share in (step, step + 1))
-            plough.move(here, blade, there, blade, 0.02)
+            plough.move(here, blade, there, blade)
     for _ in range(12):
-        plough.move(_VEHICLE_X_M, blade, _VEHICLE_X_M, blade, 0.02)
+        plough.move(_VEHICLE_X_M, blade, _VEHICLE_X_M, blade)
 
 
 def _appearance(rng: np.random.Generator) -> Appearance:

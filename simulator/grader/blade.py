@@ -27,14 +27,22 @@ LIFT_SPACING_M = 0.80
 LEVEL_TILT_MM = 50.0
 TILT_DEG_PER_MM = 0.30
 
-STEEL_FRICTION = 0.37
-"""Soil on steel, static (Table 2 of the paper)."""
-_SLOW_M_PER_S = 1e-4
+_STILL_M = 1e-6
+_STEP_CELLS = 0.45
+"""Soil is moved each time the blade has gone so far: what comes of it does not depend on the speed. Not a half: rows of
+cells would come under a blade at 0 degrees in pairs."""
+_RESTING_PASSES_N = 3
+_RESTING_M = 2e-5
+"""Soil beside a standing blade slides on, so many passes a call, until no more than this moves between two cells."""
+_LIFT_WEIGHT = 4.0
+"""An edge that goes up or down counts so many times its way: it bares or meets soil along its whole length."""
 _MOST_STEPS_N = 8
 """In one call: at 100 calls a second enough for 8 m/s. What is faster (a blade torn round by a fault) moves soil in
 coarser steps, rather than let the wires wait for it."""
-_SPREAD = ((np.arange(10) + 0.5) / 10.0)[:, None]
-"""Where along the heap's slope the parts of a column of carried soil come to lie: 0 at the face, 1 at the foot."""
+_CLEAR_CELLS = 0.3
+"""So far off its face the blade's body lays the soil that it displaces."""
+_PARTS_N = 32
+"""A column of carried soil is laid down in so many parts at most, one for each cell of the heap's slope."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +51,7 @@ class BladePose:
 
     ``angle_deg``: counter-clockwise seen from above, 0 = square to the travel. ``height_m``: cutting edge above the
     ground at the blade's centre. ``slope_deg``: cross slope, positive = left end higher. ``pitch_deg``: positive =
-    top forward.
+    top forward; it lowers the top edge, over which soil spills, and has no other effect on the soil.
     """
 
     angle_deg: float = 0.0
@@ -86,49 +94,92 @@ class _Footprint:
     wall: Wall
 
 
-class Plough:
-    """Moves soil as the blade moves through the field.
+def _way_m(x_m: float, pose: BladePose, to_x_m: float, to: BladePose) -> float:
+    """How far the blade's parts go at most, the edge's height counting :data:`_LIFT_WEIGHT` times."""
+    turn_m = abs(math.radians(to.angle_deg - pose.angle_deg)) * LENGTH_M / 2.0
+    edge_m = abs(to.height_m - pose.height_m) + abs(math.radians(to.slope_deg - pose.slope_deg)) * LENGTH_M / 2.0
+    return abs(to_x_m - x_m) + turn_m + _LIFT_WEIGHT * edge_m
 
-    Each sub-step is shorter than half a cell, up to 8 m/s. Soil that the body of the blade now covers, above the
-    cutting edge, is carried out on the side the blade moves to and laid on the slope of the heap there. It goes where
-    a rough plate drives it: square to the face, dragged sideways by the plate's own sideways motion as far as friction
-    holds (soil on steel, 0.37). A blade turned by more than the friction angle (20 degrees) therefore casts soil
-    towards its trailing end. Then the neighbourhood slides to the angle of repose, the blade being a wall up to its
-    top edge.
+
+class Plough:
+    """Moves soil as the blade moves through the field, by its way and not by the clock: every speed does the same.
+
+    Each step is shorter than half a cell, up to 8 m/s. Soil that the body of the blade now covers, above the cutting
+    edge, is carried out on the side the blade moves to and laid along the slope of the heap there. It goes where a
+    rough plate drives it: square to the face, and dragged along the face by the plate's own sideways motion as far as
+    friction holds. A rigid block would stick to the plate up to the angle of friction (20 degrees) and slide beyond it.
+    A heap gives way by and by: what holds differs from place to place on the face, so that of its friction ``f`` the
+    share ``1 - exp(-t / f)`` is mobilised (the mean over places whose coefficients are spread exponentially about
+    ``f``); ``t`` is the plate's way along its face for each way square to it: while driving, the tangent of the blade's
+    angle. What slips runs to the trailing end and past it. Then the neighbourhood slides to the angle of repose, the
+    blade being a wall up to its top edge.
     """
 
-    def __init__(self, field: SoilField, passes: int = 3) -> None:
+    def __init__(self, field: SoilField) -> None:
         self._field = field
-        self._passes = passes
         self._thickness_m = 1.5 * field.cell_m
         """Of the body behind the face; above sqrt(2) cells no soil slips through diagonally."""
         self._margin_m = 0.5
+        self._step_m = _STEP_CELLS * field.cell_m
+        self._at: tuple[float, BladePose] | None = None
+        """Where the last call left the blade."""
+        self._soil_at = (0.0, BladePose())
+        """Where it was when the soil was moved last."""
         self.restless = True
         """Whether soil near the blade is still sliding."""
 
-    def move(self, x_m: float, pose: BladePose, new_x_m: float, new_pose: BladePose, duration_s: float) -> bool:
-        """Take the blade from one place (bed x of its axis, pose) to another within ``duration_s``.
+    def move(self, x_m: float, pose: BladePose, new_x_m: float, new_pose: BladePose) -> bool:
+        """Take the blade from one place (bed x of its axis, pose) to another; how fast makes no difference.
 
         Returns whether anything moved, blade or soil.
         """
-        turn_rad = math.radians(new_pose.angle_deg - pose.angle_deg)
-        travel_m = new_x_m - x_m
-        reach_m = abs(travel_m) + abs(turn_rad) * LENGTH_M / 2.0
-        shift_m = max(
-            reach_m, abs(new_pose.height_m - pose.height_m), abs(math.radians(new_pose.slope_deg - pose.slope_deg))
-        )
-        moving = shift_m > 1e-6
+        if self._at != (x_m, pose):  # set down elsewhere
+            self._soil_at = (x_m, pose)
+        self._at = (new_x_m, new_pose)
+        moving = _way_m(x_m, pose, new_x_m, new_pose) > _STILL_M
+        way_m = _way_m(*self._soil_at, new_x_m, new_pose)
         if not (moving or self.restless):
             return False
         if not self._field.heights_m[self._window(new_x_m, new_pose).slices].any():
-            self.restless = False
-            return True
-        count = min(max(1, math.ceil(reach_m / (0.5 * self._field.cell_m))), _MOST_STEPS_N)
-        speed_m_per_s, turn_rad_per_s = travel_m / duration_s, turn_rad / duration_s
-        for number in range(1, count + 1):
-            share = number / count
-            self._step(x_m + share * travel_m, pose.between(new_pose, share), speed_m_per_s, turn_rad_per_s, moving)
+            self._soil_at, self.restless = self._at, moving
+        elif moving:
+            self.restless = True
+            if way_m >= self._step_m:
+                self._steps(new_x_m, new_pose, way_m)
+        elif way_m > _STILL_M:  # come to rest: the last part of a step
+            self._step(new_x_m, new_pose)
+        else:
+            self._rest(new_x_m, new_pose)
         return True
+
+    def _steps(self, new_x_m: float, new_pose: BladePose, way_m: float) -> None:
+        """As many whole steps as the way to there holds; what is left is for the next call."""
+        x_m, pose = self._soil_at
+        whole_n = int(way_m / self._step_m)
+        whole = whole_n * self._step_m / way_m
+        count = min(whole_n, _MOST_STEPS_N)
+        for number in range(1, count + 1):
+            share = whole * number / count
+            self._step(x_m + share * (new_x_m - x_m), pose.between(new_pose, share))
+
+    def _step(self, x_m: float, pose: BladePose) -> None:
+        """Move the soil for the way from where it was moved last."""
+        from_x_m, from_pose = self._soil_at
+        self._soil_at = (x_m, pose)
+        travel_m, turn_rad = x_m - from_x_m, math.radians(pose.angle_deg - from_pose.angle_deg)
+        window = self._window(x_m, pose)
+        body = self._footprint(window, x_m, pose)
+        self._carry_out(window, body, x_m, pose, travel_m, turn_rad)
+        self._field.follow(window, body.wall, _way_m(from_x_m, from_pose, x_m, pose))
+        self._spill_over(window, body, x_m, pose, travel_m, turn_rad)
+
+    def _rest(self, x_m: float, pose: BladePose) -> None:
+        """Soil beside a blade that stands slides on."""
+        window = self._window(x_m, pose)
+        body = self._footprint(window, x_m, pose)
+        self._carry_out(window, body, x_m, pose, 0.0, 0.0)
+        self.restless = self._field.relax(window, body.wall, _RESTING_PASSES_N) > _RESTING_M
+        self._fall_over(window, body, x_m, pose)
 
     def settle(self, x_m: float, pose: BladePose) -> None:
         """Let the soil round a blade that stands still come to rest."""
@@ -136,16 +187,8 @@ class Plough:
         footprint = self._footprint(window, x_m, pose)
         self._carry_out(window, footprint, x_m, pose, 0.0, 0.0)
         self._field.settle(window, footprint.wall)
-        self._spill_over(window, footprint, x_m, pose, 0.0, 0.0)
+        self._fall_over(window, footprint, x_m, pose)
         self.restless = False
-
-    def _step(self, x_m: float, pose: BladePose, speed_m_per_s: float, turn_rad_per_s: float, moving: bool) -> None:
-        window = self._window(x_m, pose)
-        footprint = self._footprint(window, x_m, pose)
-        self._carry_out(window, footprint, x_m, pose, speed_m_per_s, turn_rad_per_s)
-        slid_m = self._field.relax(window, footprint.wall, self._passes)
-        self._spill_over(window, footprint, x_m, pose, speed_m_per_s, turn_rad_per_s)
-        self.restless = moving or slid_m > 2e-5
 
     def _window(self, x_m: float, pose: BladePose) -> Window:
         angle = math.radians(pose.angle_deg)
@@ -163,27 +206,38 @@ class Plough:
         return _Footprint(s_body, d_m.reshape(-1)[flat], edge, Wall(mask, flat, top))
 
     def _carry_out(
-        self, window: Window, body: _Footprint, x_m: float, pose: BladePose, speed_m_per_s: float, turn_rad_per_s: float
+        self, window: Window, body: _Footprint, x_m: float, pose: BladePose, travel_m: float, turn_rad: float
     ) -> None:
-        normal, drag = self._motion(body, pose, speed_m_per_s, turn_rad_per_s)
-        forward = np.where(np.abs(normal) > _SLOW_M_PER_S, normal > 0.0, body.d_m > -self._thickness_m / 2.0)
+        normal, drag = self._motion(body, pose, travel_m, turn_rad)
+        forward = np.where(np.abs(normal) > _STILL_M, normal > 0.0, body.d_m > -self._thickness_m / 2.0)
         self._throw(window, body, x_m, pose, forward, drag)
 
     def _spill_over(
-        self, window: Window, body: _Footprint, x_m: float, pose: BladePose, speed_m_per_s: float, turn_rad_per_s: float
+        self, window: Window, body: _Footprint, x_m: float, pose: BladePose, travel_m: float, turn_rad: float
     ) -> None:
-        normal, _ = self._motion(body, pose, speed_m_per_s, turn_rad_per_s)
-        self._throw(window, body, x_m, pose, normal < -_SLOW_M_PER_S, np.zeros_like(normal))
+        normal, _ = self._motion(body, pose, travel_m, turn_rad)
+        self._throw(window, body, x_m, pose, normal < -_STILL_M, np.zeros_like(normal))
 
-    @staticmethod
-    def _motion(
-        body: _Footprint, pose: BladePose, speed_m_per_s: float, turn_rad_per_s: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Speed of the face square to itself, and the sideways drag per normal distance, for each body cell."""
+    def _fall_over(self, window: Window, body: _Footprint, x_m: float, pose: BladePose) -> None:
+        """What came to lie on a blade that stands falls down on the side where the soil is lower: it does not climb up
+        there again."""
         angle = math.radians(pose.angle_deg)
-        normal = speed_m_per_s * math.cos(angle) - turn_rad_per_s * body.s_m
-        sideways = -speed_m_per_s * math.sin(angle)
-        drag = np.clip(sideways / np.maximum(np.abs(normal), _SLOW_M_PER_S), -STEEL_FRICTION, STEEL_FRICTION)
+        heights = []
+        for d_m in (1.5 * self._field.cell_m, -self._thickness_m - 1.5 * self._field.cell_m):
+            beside_x_m = x_m + d_m * math.cos(angle) - body.s_m * math.sin(angle)
+            heights.append(self._field.height_at(beside_x_m, d_m * math.sin(angle) + body.s_m * math.cos(angle)))
+        self._throw(window, body, x_m, pose, heights[0] < heights[1], np.zeros_like(body.s_m))
+
+    def _motion(
+        self, body: _Footprint, pose: BladePose, travel_m: float, turn_rad: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Way of the face square to itself, and the sideways drag per normal distance, for each body cell."""
+        angle = math.radians(pose.angle_deg)
+        normal = travel_m * math.cos(angle) - turn_rad * body.s_m
+        sideways = -travel_m * math.sin(angle)
+        ratio = sideways / np.maximum(np.abs(normal), _STILL_M)
+        friction = self._field.soil.steel_friction
+        drag = -friction * np.sign(ratio) * np.expm1(-np.abs(ratio) / friction)
         return normal, drag
 
     def _throw(
@@ -195,20 +249,25 @@ class Plough:
         if not loaded.any():
             return
         view[body.wall.mask] -= np.where(loaded, excess, 0.0)
-        clear_m = 1.45 * self._field.cell_m
-        """Beyond sqrt(2) cells none of the four cells that receive a column belongs to the body."""
+        clear_m = _CLEAR_CELLS * self._field.cell_m
         carried = excess[loaded]
         # A heap that moves on as a whole rises by the same amount all along its slope: so is the soil spread.
-        spread_m = carried / self._field.repose_slope * _SPREAD
+        slope_m = carried / self._field.soil.repose_slope
+        parts_n = min(max(math.ceil(float(slope_m.max()) / self._field.cell_m), 4), _PARTS_N)
+        spread_m = slope_m * ((np.arange(parts_n) + 0.5) / parts_n)[:, None]
         beyond = np.where(forward[loaded], 0.0, -1.0) * self._thickness_m
         outwards = np.where(forward[loaded], 1.0, -1.0)
         d_to = beyond + outwards * (clear_m + spread_m)
         s_to = body.s_m[loaded] + drag[loaded] * np.abs(d_to - body.d_m[loaded])
         angle = math.radians(pose.angle_deg)
         cos, sin = math.cos(angle), math.sin(angle)
-        columns = np.broadcast_to(carried / _SPREAD.size, d_to.shape)
+        columns = np.broadcast_to(carried / parts_n, d_to.shape)
         self._field.deposit(
-            window, (x_m + d_to * cos - s_to * sin).ravel(), (d_to * sin + s_to * cos).ravel(), columns.ravel()
+            window,
+            body.wall,
+            (x_m + d_to * cos - s_to * sin).ravel(),
+            (d_to * sin + s_to * cos).ravel(),
+            columns.ravel(),
         )
 
 

@@ -14,12 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from graderd.simulator.grader.blade import LENGTH_M, REACH_M, BladePose, blade_grid
-from graderd.simulator.grader.soil import REPOSE_DEG, FloatArray, SoilField
+from graderd.simulator.grader.soil import FloatArray, SoilField
 
-DENSITY_KG_PER_M3 = 1600.0
-"""Bulk density of loose moist soil."""
 GRAVITY_M_PER_S2 = 9.81
-SOIL_FRICTION = 0.49
 
 TURNTABLE_SHARE = 0.08
 """Part of the soil's moment that reaches the servo: the slewing ring's worm stage and friction take the rest.
@@ -85,11 +82,11 @@ def _side(
     strip_near = np.clip(((s_m[near] + LENGTH_M / 2.0) / width).astype(np.intp), 0, _STRIPS - 1)
     counted = np.maximum(np.bincount(strip_near, minlength=_STRIPS), 1)
     depth = np.bincount(strip_near, above[near], minlength=_STRIPS) / counted
-    gamma = DENSITY_KG_PER_M3 * GRAVITY_M_PER_S2
-    active = math.tan(math.radians(45.0 - REPOSE_DEG / 2.0)) ** 2
+    gamma = field.soil.density_kg_per_m3 * GRAVITY_M_PER_S2
+    active = math.tan(math.radians(45.0 - field.soil.repose_deg / 2.0)) ** 2
     passive = 1.0 / active
     leaning = 0.5 * active * gamma * depth**2
     cut = np.minimum(depth, _CUT_M)
-    pushing = SOIL_FRICTION * gamma * section + 0.5 * passive * gamma * cut**2
+    pushing = field.soil.soil_friction * gamma * section + 0.5 * passive * gamma * cut**2
     share = np.clip(normal / _FULL_DRAG_M_PER_S, 0.0, 1.0)
     return np.asarray((leaning + share * pushing) * width)

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from graderd.simulator.grader.blade import BladePose, Plough, volumes_in_front_m3
-from graderd.simulator.grader.load import DENSITY_KG_PER_M3, BladeLoad, blade_load
+from graderd.simulator.grader.load import BladeLoad, blade_load
 from graderd.simulator.grader.piles import SceneZone, lay_scene
 from graderd.simulator.grader.soil import FloatArray, SoilField
 
@@ -92,7 +92,7 @@ class World:
         """Let ``step_s`` pass, in which the actuators took the blade to ``pose``."""
         before_m = self.vehicle.x_m
         self.vehicle.step(step_s)
-        moved = self.plough.move(before_m, self.blade, self.vehicle.x_m, pose, step_s)
+        moved = self.plough.move(before_m, self.blade, self.vehicle.x_m, pose)
         turn_rad_per_s = math.radians(pose.angle_deg - self.blade.angle_deg) / step_s
         self.blade = pose
         # Where nothing moved the load is what it was; the first step at rest still counts as one in which soil slides.
@@ -117,7 +117,7 @@ class World:
     @property
     def soil_kg(self) -> float:
         """All soil in the bed."""
-        return self.field.volume_m3 * DENSITY_KG_PER_M3
+        return self.field.volume_m3 * self.field.soil.density_kg_per_m3
 
 
 def scene_heights(zone: SceneZone, x_m: float, pose: BladePose, seed: int) -> FloatArray:

@@ -14,7 +14,7 @@ from graderd.core.blade import meeting_point
 from graderd.simulator.grader.blade import FACE_HEIGHT_M, BladePose, Plough, blade_grid, volumes_in_front_m3
 from graderd.simulator.grader.load import blade_load
 from graderd.simulator.grader.piles import SceneZone, heap, lay_scene, layer
-from graderd.simulator.grader.soil import REPOSE_DEG, FloatArray, SoilField
+from graderd.simulator.grader.soil import MOIST_LOAM, FloatArray, SoilField
 
 X_M = 3.0
 
@@ -25,7 +25,7 @@ def moved(field: SoilField, pose: BladePose, travel_m: float, step_m: float = 0.
     plough.settle(X_M, pose)
     x_m = X_M
     for _ in range(round(travel_m / step_m)):
-        plough.move(x_m, pose, x_m + step_m, pose, 0.01)
+        plough.move(x_m, pose, x_m + step_m, pose)
         x_m += step_m
     return x_m
 
@@ -37,7 +37,7 @@ def turned(field: SoilField, from_deg: float, to_deg: float) -> None:
     count = math.ceil(abs(to_deg - from_deg) / 0.3)
     angles = np.linspace(from_deg, to_deg, count + 1)
     for before, after in pairwise(angles):
-        plough.move(X_M, BladePose(float(before)), X_M, BladePose(float(after)), 0.01)
+        plough.move(X_M, BladePose(float(before)), X_M, BladePose(float(after)))
 
 
 @settings(max_examples=25, deadline=None)
@@ -67,7 +67,7 @@ def test_rig_mass_is_conserved_whatever_the_blade_does(
     x_m, pose = float(rng.uniform(0.0, 8.0)), BladePose()
     for travel_m, angle_deg, blade_height_m, slope_deg, pitch_deg in moves:
         new_x_m, new_pose = x_m + travel_m, BladePose(angle_deg, blade_height_m, slope_deg, pitch_deg)
-        plough.move(x_m, pose, new_x_m, new_pose, 0.01)
+        plough.move(x_m, pose, new_x_m, new_pose)
         x_m, pose = new_x_m, new_pose
     assert field.volume_m3 == pytest.approx(before_m3, rel=1e-12)
     assert field.heights_m.min() >= -1e-12
@@ -78,7 +78,7 @@ def test_rig_soil_comes_to_rest_at_the_angle_of_repose() -> None:
     field.heights_m[200, 50] = 60.0
     before_m3 = field.volume_m3
     field.settle(field.whole)
-    steepest = math.tan(math.radians(REPOSE_DEG))
+    steepest = math.tan(math.radians(MOIST_LOAM.repose_deg))
     for axis in (0, 1):
         slope = np.abs(np.diff(field.heights_m, axis=axis)) / field.cell_m
         assert slope.max() < steepest * 1.02
@@ -112,7 +112,7 @@ def test_rig_soil_higher_than_the_blade_spills_over_it() -> None:
 
 def test_rig_blade_pushes_soil_ahead_and_leaves_the_floor_clean() -> None:
     field = SoilField()
-    field.add(layer(field, X_M, X_M + 2.0, 0.9, 0.05))
+    field.add(layer(field, X_M, X_M + 2.0, 0.9, 0.03))  # a blade holds 37 l a metre under its top edge
     x_m = moved(field, BladePose(), 1.0)
     left, center, right = (1e3 * volume for volume in volumes_in_front_m3(field, x_m, 0.0))
     assert left + center + right > 25.0
@@ -131,7 +131,7 @@ def test_rig_a_raised_edge_leaves_soil_behind() -> None:
 
 def test_rig_a_cross_slope_leaves_more_under_the_higher_end() -> None:
     field = SoilField()
-    field.add(layer(field, X_M, X_M + 2.0, 0.9, 0.08))
+    field.add(layer(field, X_M, X_M + 2.0, 0.9, 0.05))
     x_m = moved(field, BladePose(height_m=0.02, slope_deg=3.0), 1.0)
     trail = field.heights_m[round((X_M + 0.3) / 0.02) : round((x_m - 0.2) / 0.02)].mean(axis=0)
     assert trail[62:68].mean() > trail[32:38].mean() + 0.01
@@ -151,14 +151,65 @@ def test_rig_soil_is_cast_towards_the_trailing_end(angle_deg: float) -> None:
     assert middles[1.0] == pytest.approx(-middles[-1.0], abs=0.03)
 
 
-def test_rig_below_the_friction_angle_the_soil_sticks_and_is_hardly_cast() -> None:
-    middle = {}
-    for angle_deg in (10.0, 45.0):
-        field = SoilField()
-        field.add(heap(field, X_M + 0.5, 0.0, 0.4, 0.4, 0.2))
-        moved(field, BladePose(angle_deg), 1.0)
-        middle[angle_deg] = float((field.heights_m.sum(axis=0) * field.y_m).sum() / field.heights_m.sum())
-    assert abs(middle[10.0]) < 0.4 * middle[45.0]
+def pushed(
+    angle_deg: float, *, cell_m: float = 0.02, step_m: float = 0.005, pitch_deg: float = 0.0, height_m: float = 0.14
+) -> SoilField:
+    """A heap 0.45 m wide, the same on every grid, after a blade pushed it for 0.8 m and stopped."""
+    field = SoilField(cell_m=cell_m)
+    along, across = (field.x_m - X_M - 0.5)[:, None] / 0.3, field.y_m[None, :] / 0.225
+    field.add(height_m * np.sqrt(np.clip(1.0 - along**2 - across**2, 0.0, None)))
+    plough, pose = Plough(field), BladePose(angle_deg, pitch_deg=pitch_deg)
+    plough.settle(X_M, pose)
+    places = X_M + np.linspace(0.0, 0.8, round(0.8 / step_m) + 1)
+    for here, there in pairwise(places):
+        plough.move(float(here), pose, float(there), pose)
+    end_m = float(places[-1])
+    while plough.move(end_m, pose, end_m, pose):
+        pass
+    return field
+
+
+def cast_mm(field: SoilField) -> float:
+    """How far to the left the soil's centre of mass lies of the middle line."""
+    return float((field.heights_m.sum(axis=0) * field.y_m).sum() / field.heights_m.sum()) * 1e3
+
+
+def width_mm(field: SoilField) -> float:
+    """Width of an even layer that is spread as far across the bed."""
+    across = field.heights_m.sum(axis=0)
+    variance = (across * (field.y_m - cast_mm(field) / 1e3) ** 2).sum() / across.sum()
+    return math.sqrt(12.0 * variance) * 1e3
+
+
+def test_rig_casting_grows_smoothly_with_the_angle() -> None:
+    """With friction that lets go all at once it jumped at 20 degrees, and 15 did as 0 does."""
+    cast = np.array([cast_mm(pushed(angle_deg)) for angle_deg in range(0, 50, 5)])
+    more = np.diff(cast)
+    assert more.min() > 0.0
+    assert np.abs(np.diff(more)).max() < 0.4 * more.max()
+    assert 0.2 * cast[9] < cast[3] < 0.4 * cast[9]
+
+
+@pytest.mark.parametrize("angle_deg", [15.0, 30.0])
+def test_rig_soil_goes_by_the_way_and_not_by_speed_or_grid(angle_deg: float) -> None:
+    """A tick is 10 ms: 1 mm of way is 0.1 m/s, 10 mm is 1 m/s."""
+    reference = pushed(angle_deg)
+    for step_m in (0.001, 0.01):
+        other = pushed(angle_deg, step_m=step_m)
+        assert cast_mm(other) == pytest.approx(cast_mm(reference), rel=0.01)
+        assert width_mm(other) == pytest.approx(width_mm(reference), rel=0.01)
+    for cell_m in (0.01, 0.04):
+        other = pushed(angle_deg, cell_m=cell_m)
+        assert cast_mm(other) == pytest.approx(cast_mm(reference), rel=0.05)
+        assert width_mm(other) == pytest.approx(width_mm(reference), rel=0.05)
+
+
+def test_rig_pitch_lowers_the_top_edge_and_does_nothing_else() -> None:
+    straight, pitched = (pushed(30.0, pitch_deg=pitch_deg, height_m=0.1) for pitch_deg in (0.0, 15.0))
+    assert np.array_equal(straight.heights_m, pitched.heights_m)
+    over = [pushed(0.0, pitch_deg=pitch_deg, height_m=0.4).heights_m for pitch_deg in (0.0, 15.0)]
+    behind = [heights[: round((X_M + 0.74) / 0.02), 40:60].sum() for heights in over]
+    assert behind[1] > 1.02 * behind[0]
 
 
 def test_rig_soil_spills_round_the_ends() -> None:
@@ -209,7 +260,7 @@ def test_rig_even_soil_lies_evenly_ahead_while_the_blade_turns_to_45_and_drives(
     for tick in range(450):
         new_deg = min(45.0, angle_deg + 0.3)
         new_x_m = x_m + (0.01 if tick > 250 else 0.0)
-        plough.move(x_m, BladePose(angle_deg), new_x_m, BladePose(new_deg), 0.01)
+        plough.move(x_m, BladePose(angle_deg), new_x_m, BladePose(new_deg))
         x_m, angle_deg = new_x_m, new_deg
         if tick % 50 == 49:
             shares.append(ahead_of_the_heap(field, x_m, angle_deg))
