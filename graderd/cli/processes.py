@@ -108,6 +108,7 @@ def _rig(app: typer.Typer) -> None:
         epilog=example(
             "graderd rig --dir grader --seed 1",
             "graderd rig dataset --out frames --scenes 300 --seed 7",
+            "graderd rig experiment --out experiment",
             "graderd rig scene left              (lays soil before the blade of a running simulated grader)",
             "graderd rig drive --distance-m 3",
             "graderd rig -- --help          (all its options)",
@@ -117,12 +118,13 @@ def _rig(app: typer.Typer) -> None:
         """Run the simulated grader, or write a data set with it.
 
         Soil, blade, camera, virtual servo and virtual actuators in a process of their own, which announces itself in
-        rig.json in its directory (a JSON object). 'dataset' writes a set of labelled frames instead; 'scene', 'drive'
-        and 'halt' tell the rig of the daemon that runs what to do. All further arguments are the rig's own.
+        rig.json in its directory (a JSON object). 'dataset' writes a set of labelled frames instead; 'experiment'
+        drives passes over soil left, center and right at three angles with its own daemon and measures them; 'scene',
+        'drive' and 'halt' tell the rig of the daemon that runs what to do. Further arguments are the rig's own.
         """
         arguments = context.args
-        if arguments[:1] == ["dataset"]:
-            hand_over("graderd.simulator.dataset", arguments[1:])
+        if arguments[:1] and arguments[0] in ("dataset", "experiment"):
+            hand_over(f"graderd.simulator.{arguments[0]}", arguments[1:])
         elif arguments[:1] and arguments[0] in ("scene", "drive", "halt"):
             hand_over("graderd.simulator.ask", [_control_of(client_of(context)), *arguments])
         else:

@@ -23,7 +23,8 @@ from graderd.evaluation.ground import F64
 from graderd.hal.camera import Frame
 from graderd.record.files import RecordingFile
 from graderd.record.frames import Judged, messages_of
-from harness.top_view import HALF_VIEW, TopCamera, heap, save, trapezoid
+from graderd.simulator.camera.top import TopCamera, save
+from harness.top_view import HALF_VIEW, heap, trapezoid
 
 pytestmark = pytest.mark.xdist_group("evaluate cli")  # one set of scans for all
 

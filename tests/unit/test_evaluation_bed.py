@@ -24,7 +24,8 @@ from graderd.evaluation.measures import (
 )
 from graderd.evaluation.statistics import interval
 from graderd.evaluation.uncertainty import estimate
-from harness.top_view import HALF_VIEW, TopCamera, heap, known_bed, trapezoid
+from graderd.simulator.camera.top import TopCamera
+from harness.top_view import HALF_VIEW, heap, known_bed, points_of, trapezoid
 
 ALL = tuple(Spread)
 UP, AHEAD = np.array((0.0, 0.0, 1.0)), np.array((1.0, 0.0, 0.0))
@@ -52,7 +53,7 @@ def test_height_within_a_millimetre_and_spread_within_a_hundredth(seed: int) -> 
     tilt = (5.0, 0.0, -3.5, 3.5)[seed]
     noise_px = (0.37, 0.37, 0.25, 0.09)[seed]
     camera = replace(known.camera, pitch_deg=tilt, roll_deg=math.sqrt(25.0 - tilt**2), noise_px=noise_px)
-    scans = camera.points(known.surface, 10)
+    scans = points_of(camera, known.surface, 10)
     assert len(scans[0].points_mm) < 0.81 * 848 * 480  # a fifth is missing, in the same places every time
     bed = bed_of(scans, 10.0)
     found = known.measures(bed, bed.heights_mm)
@@ -140,7 +141,7 @@ def test_the_sides_of_the_bed_end_it(cell_mm: float, scans_n: int, noise_px: flo
     surface = heap(trapezoid(150.0, 250.0, 640.0, 70.0), -500.0, 480.0, 100.0)
     camera = TopCamera(height_mm=1300.0, pitch_deg=-2.0, roll_deg=3.0, seed=12, noise_px=noise_px)
     free, walled = (
-        bed_of(each.points(surface, scans_n), cell_mm) for each in (camera, replace(camera, wall_y_mm=1000.0))
+        bed_of(points_of(each, surface, scans_n), cell_mm) for each in (camera, replace(camera, wall_y_mm=1000.0))
     )
     one, other = (spread(each.heights_mm, each.grid, each.noise_mm, Rules(), ALL) for each in (free, walled))
     seen = walled.grid.y_mm[np.isfinite(walled.heights_mm).any(axis=0)]
@@ -278,7 +279,7 @@ def test_nothing_there_is_said() -> None:
 def test_one_scan_has_an_interval_too_and_no_bare_ground_has_none() -> None:
     surface = heap(trapezoid(0.0, 250.0, 640.0, 70.0), -200.0, 200.0, 60.0)
     camera = TopCamera(height_mm=1300.0, seed=3, lens=HALF_VIEW)
-    bed = bed_of(camera.points(surface, 1), 20.0)
+    bed = bed_of(points_of(camera, surface, 1), 20.0)
     found = estimate([bed], lambda maps: spread(maps[0], bed.grid, bed.noise_mm, Rules(), ALL))
     assert all(1.0 < each.deviation < 40.0 for each in found.values())
     blind = replace(bed, residual_mm=np.full_like(bed.residual_mm, np.nan))

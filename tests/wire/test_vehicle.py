@@ -20,7 +20,7 @@ from graderd.hal.settings import CanSettings, VehicleSettings
 from graderd.hal.vehicle import VehicleTelemetry
 from graderd.runtime.app.sim import RIG_FRAME_AGE_S, RIG_STREAMS, attach
 from graderd.simulator.control_client import RigControl
-from graderd.simulator.demo import CONFIG as DEMONSTRATION
+from graderd.simulator.operator import CONFIG as PATIENT
 from graderd.simulator.process import Rig
 from harness.electrak_sim import until
 from tests.rig_process import rig_here
@@ -210,6 +210,6 @@ def test_a_rigs_picture_may_be_older_and_older_still_where_the_configuration_say
     """Rendering takes a while; the demonstration, beside others on a busy machine, gives it a second."""
     names = {"servo": "s", "can": {"interface": "slcan", "channel": "c"}, "camera": "p", "control": "k"}
     (tmp_path / "rig.json").write_text(json.dumps({"pid": 1, "stop_input": "t", **names}))
-    patient = parse(tomllib.loads(DEMONSTRATION.format(socket=tmp_path / "s")))
+    patient = parse(tomllib.loads(PATIENT.format(socket=tmp_path / "s")))
     for config, most_s in ((Config(), RIG_FRAME_AGE_S), (patient, 1.0)):
         assert attach(config, tmp_path).perception.decision.max_frame_age_s == most_s
