@@ -81,7 +81,7 @@ class Hooks:
             # Less than nothing: below any limit that may be configured, 0 included.
             shutil.disk_usage = (lambda path: usage(path)._replace(free=-1)) if wanted["disk_full"] else usage
         if "disk_stalled" in wanted:
-            os.write = self._hang if wanted["disk_stalled"] else self._write
+            vars(os)["write"] = self._hang if wanted["disk_stalled"] else self._write
         if "memory_mb" in wanted:
             threading.Thread(target=self._take_memory, args=(int(wanted["memory_mb"]),), daemon=True).start()
 
