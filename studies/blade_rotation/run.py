@@ -131,12 +131,14 @@ class _Work:
         dangerous = sum(engine.dangerous_builds(path.read_text()) for path in self._folder.glob("push.*.log"))
         density = deck.soil_of(case).density_kg_per_m3
         measures = outcome.measures(case, frames, forces, along, plan_.contact_step * self._dt)
+        checks = outcome.checks(frames, forces, density, dangerous)
+        tables = outcome.tables(case, frames, forces, along)
         if case.motion == "coupled":
             from graderd.studies.blade_rotation import coupled  # needs MuJoCo
 
-            measures |= coupled.measures(self._folder, plan_.contact_step * self._dt)
-        checks = outcome.checks(frames, forces, density, dangerous)
-        tables = outcome.tables(case, frames, forces, along)
+            machine = coupled.readings(self._folder)
+            measures |= coupled.measures(machine, plan_.contact_step * self._dt)
+            tables["machine"] = coupled.table(machine)
         result = Result(
             key=case.key(),
             case=case,
@@ -223,11 +225,19 @@ class _Work:
 
     def _frames(self, plan_: Plan, legs: list[Leg]) -> list[Frame]:
         found = []
+        machine = None
+        if self._case.motion == "coupled":
+            from graderd.studies.blade_rotation import coupled  # needs MuJoCo
+
+            machine = coupled.readings(self._folder)
         for step, grains in files.frames(self._folder).items():
             leg = next((leg for leg in legs if step <= leg.until_step), legs[-1])
             time_s = step * self._dt
             travel_m = (step - plan_.contact_step) * self._dt * self._case.speed_m_per_s
-            found.append(Frame(time_s, travel_m, leg.motion.at(time_s), grains))
+            blade = leg.motion.at(time_s)
+            if machine is not None and step:
+                blade = coupled.motion(machine, time_s)
+            found.append(Frame(time_s, travel_m, blade, grains))
         return found
 
 

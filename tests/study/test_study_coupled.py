@@ -119,16 +119,16 @@ def in_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Coupled:
     ctypes.CDLL(f"{sys.prefix}/lib/libmpi.so.12", mode=ctypes.RTLD_GLOBAL)
     real = engine.run
 
-    def run_(case: Case, holder: Callable[[Pose], Holder] | None = None, coupling_s: float = 1e-3) -> Result:
+    def run_(case: Case, holder: Callable[[Pose], Holder] | None = None, every_n: int = 1) -> Result:
         def instead(arguments: Sequence[str], folder: Path, log: str, progress: Progress | None = None) -> float:
             if run.COUPLED not in arguments:
                 return real(arguments, folder, log, progress)
-            coupled.run_leg(folder, arguments[-2], int(arguments[-1]), holder, coupling_s)
+            coupled.run_leg(folder, arguments[-2], int(arguments[-1]), holder, every_n)
             return 0.0
 
         monkeypatch.setattr(engine, "run", instead)
-        name = f"{coupling_s:g}-{holder}"
-        return run_case(case.model_copy(update={"motion": "coupled"}), Store(tmp_path / str(abs(hash(name)))))
+        folder = tmp_path / f"{'machine' if holder is None else 'other'}-{every_n}"
+        return run_case(case.model_copy(update={"motion": "coupled"}), Store(folder))
 
     return run_
 
@@ -138,8 +138,6 @@ def test_coupled_to_a_rigid_machine_the_run_is_the_imposed_one(tmp_path: Path, i
     rigid = in_process(CASE, Rigid)
     for name in ("blade_load_n", "draft_n", "side_draft_n", "yaw_torque_nm", "spread_mass_90_mm"):
         assert rigid.measures[name] == pytest.approx(one_way.measures[name], rel=0.01), name
-    assert rigid.measures["apart_max_m"] < 1e-9
-    assert rigid.measures["interface_share"] < 1e-9
     assert rigid.checks["momentum_share"] == pytest.approx(one_way.checks["momentum_share"], abs=0.01)
 
 
@@ -161,13 +159,12 @@ def test_a_machine_ten_times_as_stiff_is_all_but_rigid(tmp_path: Path, in_proces
 
 
 def test_what_the_coupling_adds_is_little_and_its_step_does_not_matter(in_process: Coupled) -> None:
-    whole, half = in_process(CASE), in_process(CASE, None, 0.5e-3)
-    assert whole.measures["interface_share"] < 0.01
-    assert whole.measures["apart_max_m"] < 1e-4
+    whole, half = in_process(CASE, None, 2), in_process(CASE)
+    assert half.measures["interface_share"] < whole.measures["interface_share"] < 0.01
     assert whole.checks["gained_share"] < 0.01
     # The soil's mean pull on the blade is what the chassis feels, but for what its speed stores.
     assert whole.measures["machine_draft_n"] == pytest.approx(whole.measures["draft_n"], rel=0.02)
-    for name in ("blade_load_n", "draft_n", "spread_mass_90_mm", "servo_load_mean_nm"):
+    for name in ("blade_load_n", "draft_n", "spread_mass_90_mm"):
         assert half.measures[name] == pytest.approx(whole.measures[name], rel=0.03), name
 
 
