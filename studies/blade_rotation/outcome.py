@@ -12,7 +12,7 @@ import numpy as np
 from graderd.core.blade import blade_coordinates
 from graderd.evaluation.bed import Grid
 from graderd.evaluation.load import load, load_along
-from graderd.evaluation.measures import Blade, NothingThereError, Rules, Spread, height_difference, spread
+from graderd.evaluation.measures import Blade, Interval, NothingThereError, Rules, Spread, height_difference, spread
 from graderd.studies.blade_rotation.case import NEWTON_G_M_PER_S2, Case, Work
 from graderd.studies.blade_rotation.lammps import FORCES, Motion
 from graderd.studies.blade_rotation.pile import F64
@@ -24,6 +24,8 @@ CELL_MM = 20.0
 MARGIN_MM = 200.0
 RULES = Rules(edge_mm=10.0)
 """As ``graderd evaluate`` has it."""
+WHOLE = Rules(RULES.edge_mm, Interval(-1e9, 1e9), Interval(-1e9, 1e9))
+"""The same over all that is known, as over an area that is named."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,16 +38,23 @@ class Frame:
     grains: F64
 
 
-def surface(grains: F64, cell_mm: float = CELL_MM) -> tuple[Grid, F64]:
-    """Height of the topmost grain over each cell's middle, mm; bare floor is 0, and there is some all about."""
+def grid_over(*states: F64) -> Grid:
+    """Cells for all states of the grains, with bare floor all about."""
+    low, high = [], []
+    for column in (1, 2):
+        edges = [(float((g[:, column] - g[:, 4]).min()), float((g[:, column] + g[:, 4]).max())) for g in states]
+        low.append(math.floor((min(a for a, _ in edges) * 1000.0 - MARGIN_MM) / CELL_MM))
+        high.append(math.ceil((max(b for _, b in edges) * 1000.0 + MARGIN_MM) / CELL_MM))
+    return Grid(CELL_MM, low[0], low[1], high[0] - low[0], high[1] - low[1])
+
+
+def surface(grains: F64, grid: Grid) -> F64:
+    """Height of the topmost grain over each cell's middle, mm; bare floor is 0."""
     x, y, z, r = (grains[:, column] * 1000.0 for column in (1, 2, 3, 4))
-    low = [math.floor((float((each - r).min()) - MARGIN_MM) / cell_mm) for each in (x, y)]
-    high = [math.ceil((float((each + r).max()) + MARGIN_MM) / cell_mm) for each in (x, y)]
-    grid = Grid(cell_mm, low[0], low[1], high[0] - low[0], high[1] - low[1])
     heights = np.zeros((grid.cells_x, grid.cells_y))
-    reach = math.ceil(float(r.max()) / cell_mm) + 1
-    i = np.floor(x / cell_mm).astype(int) - grid.first_x
-    j = np.floor(y / cell_mm).astype(int) - grid.first_y
+    reach = math.ceil(float(r.max()) / grid.cell_mm) + 1
+    i = np.floor(x / grid.cell_mm).astype(int) - grid.first_x
+    j = np.floor(y / grid.cell_mm).astype(int) - grid.first_y
     for di in range(-reach, reach + 1):
         for dj in range(-reach, reach + 1):
             a, b = i + di, j + dj
@@ -53,26 +62,33 @@ def surface(grains: F64, cell_mm: float = CELL_MM) -> tuple[Grid, F64]:
             under = off2 <= r**2
             top = z[under] + np.sqrt(r[under] ** 2 - off2[under])
             np.maximum.at(heights, (a[under], b[under]), top)
-    return grid, heights
+    return heights
 
 
-def quality(case: Case, frame: Frame) -> dict[str, float]:
-    """Work quality as it would be measured if the pass ended here; nothing where there is no soil to measure."""
-    grid, heights = surface(frame.grains)
-    yaw_deg = math.degrees(frame.blade.yaw_rad)
+def quality(case: Case, before: Frame, frame: Frame) -> dict[str, float]:
+    """Work quality as it would be measured if the pass ended at ``frame``; nothing where there is no soil to measure.
+
+    The layer of flattening is where soil stood above the desired height ``before``, as far as the blade has passed.
+    """
     x_mm, y_mm, _ = (place * 1000.0 for place in frame.blade.place_m)
+    yaw_deg = math.degrees(frame.blade.yaw_rad)
     try:
-        if case.work is not Work.FLATTENING:
-            blade = Blade(x_mm, y_mm, yaw_deg, case.blade.length_m * 1000.0, case.travel_m * 1000.0)
-            try:
-                return spread(heights, grid, 0.0, RULES, tuple(Spread), blade)
-            except NothingThereError:  # the blade still has all of it
-                return spread(heights, grid, 0.0, RULES, tuple(Spread))
-        # What the blade has not passed is no layer yet.
-        across, ahead = np.meshgrid(grid.x_mm - x_mm, grid.y_mm - y_mm, indexing="ij")
-        _, d_mm = blade_coordinates(across, ahead, yaw_deg)
-        behind = np.where(d_mm < 0.0, heights, np.nan)
-        return height_difference(behind, grid, case.gap_m * 1000.0, 0.0, float("nan"), RULES)
+        if case.work is Work.FLATTENING:
+            grid = grid_over(before.grains, frame.grains)
+            heights = surface(frame.grains, grid)
+            along, across = np.meshgrid(grid.x_mm - x_mm, grid.y_mm - y_mm, indexing="ij")
+            _, ahead_mm = blade_coordinates(along, across, yaw_deg)
+            target_mm = case.gap_m * 1000.0
+            layer = (ahead_mm < 0.0) & (surface(before.grains, grid) > target_mm)
+            known = np.where(layer, heights, np.nan)
+            return height_difference(known, grid, target_mm, 0.0, float("nan"), WHOLE)
+        grid = grid_over(frame.grains)
+        heights = surface(frame.grains, grid)
+        blade = Blade(x_mm, y_mm, yaw_deg, case.blade.length_m * 1000.0, case.travel_m * 1000.0)
+        try:
+            return spread(heights, grid, 0.0, RULES, tuple(Spread), blade)
+        except NothingThereError:  # the blade still has all of it
+            return spread(heights, grid, 0.0, RULES, tuple(Spread))
     except NothingThereError:
         return {}
 
@@ -83,7 +99,7 @@ def measures(case: Case, frames: list[Frame], forces: F64, along: F64, contact_s
     column = {name: forces[:, number] for number, name in enumerate(FORCES)}
     since = column["time"] >= contact_s
     resultant = np.column_stack([column[name][since] for name in ("fx", "fy", "fz")])
-    found = quality(case, frames[-1]) | load(resultant) | load_along(along.sum(axis=0))
+    found = quality(case, frames[0], frames[-1]) | load(resultant) | load_along(along.sum(axis=0))
     found["draft_n"] = float(-column["fx"][since].mean())
     found["side_draft_n"] = float(column["fy"][since].mean())
     found["yaw_torque_nm"] = float(column["mz"][since].mean())
@@ -145,7 +161,7 @@ def tables(case: Case, frames: list[Frame], forces: F64, along: F64) -> dict[str
     """What is kept beside the measures: quality over the travel, forces over time, load along the blade, the soil."""
     import pyarrow as pa
 
-    over = [{"travel_m": frame.travel_m} | quality(case, frame) for frame in frames]
+    over = [{"travel_m": frame.travel_m} | quality(case, frames[0], frame) for frame in frames]
     names = list(dict.fromkeys(name for row in over for name in row))
     step = pairwise([frame.time_s for frame in frames])
     soil = {

@@ -36,8 +36,8 @@ COUPLED = "graderd.studies.blade_rotation.coupled"
 """Runs a leg with engine and multibody machine in one process."""
 END_MARK = b"LammpS RestartT"
 """Begins and ends a restart file of LAMMPS (its read_restart looks for the same)."""
-RESTART_PARTICLE_STEPS = 1.5e8
-"""Between two restart files: two minutes or so on a core of its own."""
+RESTART_PARTICLE_STEPS = 3e7
+"""Between two restart files, or a frame if that is longer: half a minute or so on a core of its own."""
 
 Told = Callable[[float], None]
 """Is told which share of the case is done."""

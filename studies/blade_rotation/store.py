@@ -92,7 +92,7 @@ class Store:
     def _read(self, path: Path) -> Result | None:
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return None
         return Result(**data | {"case": Case.model_validate(data["case"])})
 
