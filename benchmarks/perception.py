@@ -48,7 +48,7 @@ def measure(frames: FrameSet) -> tuple[dict[Method, Score], dict[str, list[float
     """Scores of the four methods, CPU times (paper, fast_color, depth, fused, copy), and on how many paper and
     fast_color gave the same answer."""
     # As the daemon judges, but that one picture comes several times.
-    settings = PerceptionSettings(health=HealthSettings(frozen_frames_n=0))
+    settings = PerceptionSettings(health=HealthSettings(frozen_frames_n=1_000_000))
     classifiers = {
         method: make_classifier(settings.model_copy(update={"method": method}), frames.calibration, frames.blade)
         for method in METHODS

@@ -9,8 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
 from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Mounting, PictureFault, SoilAhead, SoilObservation, Thirds, Zone
@@ -261,7 +259,7 @@ class SoilClassifier:
         return SoilObservation(
             capture_s=frame.capture_s,
             zone=verdict.zone,
-            confidence=float(np.clip(verdict.confidence, 0.0, 1.0)),
+            confidence=min(max(verdict.confidence, 0.0), 1.0),
             reason=verdict.reason,
             share_left=verdict.shares[LEFT],
             share_center=verdict.shares[CENTER],
@@ -275,9 +273,7 @@ class SoilClassifier:
             method=self._settings.method,
             cpu_ms=(time.thread_time() - start_s) * 1000.0,
             faults=tuple(faults),
-            ahead=SoilAhead(
-                ahead.zone, float(np.clip(ahead.confidence, 0.0, 1.0)), ahead.reason, _thirds(ahead.volumes_l)
-            )
+            ahead=SoilAhead(ahead.zone, min(max(ahead.confidence, 0.0), 1.0), ahead.reason, _thirds(ahead.volumes_l))
             if ahead
             else None,
             carried=_thirds(judged.carried_l) if judged.carried_l else None,

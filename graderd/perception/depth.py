@@ -9,6 +9,7 @@ behind it included.
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 
@@ -31,7 +32,7 @@ from graderd.perception.forms import (
     standing,
     steep_cells,
 )
-from graderd.perception.geometry import F32, F64, NOMINAL_WIDTH_PX, U8, View, third_outlines_px
+from graderd.perception.geometry import F32, F64, NOMINAL_WIDTH_PX, View, cos_sin, third_outlines_px
 from graderd.perception.ground import Ground, GroundFit
 from graderd.perception.registration import BladeFinder, BladeFix, Stance, UpperEdge
 from graderd.perception.settings import DecisionSettings, DepthSettings
@@ -43,7 +44,7 @@ NOTHING: Litres = (0.0, 0.0, 0.0)
 LEAST_CELLS_N = 6
 """A map of fewer cells along the blade or ahead of it, on a toy's blade, would show no form."""
 KEPT_GRIDS_N = 64
-"""Thirds of the picture are kept for so many blade angles, a degree apart: 1 MB."""
+"""Thirds of the picture are kept for so many blade angles, a degree apart: 3 MB."""
 CONTEXT_M = 0.14
 """The height map goes on so far beyond the reach: what stands at its border is judged by what stands before it."""
 BESIDE_RATIO = 0.87
@@ -71,7 +72,7 @@ class HeightMap:
 
     ``seen`` is False where the height was filled in. Triples are per third: left, center, right. ``valid``: share of
     the pixels on it that measure it, neither without depth nor hidden by something nearer. ``volumes_l``: all soil
-    before each third to the reach; ``carried_l``, ``ahead_l``: see :func:`graderd.perception.split.split_soil`.
+    before each third to the reach; ``carried_l``, ``ahead_l``: see :class:`SoilSplit`.
     ``doubtful_l``, ``doubtful_ahead_l``: what of ``volumes_l`` and ``ahead_l`` lies beside something that is no soil.
     ``things_l``, ``weak_l``: what else rises there, and is no soil or does not stand out of the uneven ground.
     ``angle_deg``: where the blade was found. ``standing_at_m``: s and d of something that stands upright. ``cut_m``:
@@ -92,10 +93,10 @@ class HeightMap:
     ground: Ground
     blade: BladeFix
     angle_deg: float
-    edge: UpperEdge | None = None
-    standing_at_m: tuple[float, float] | None = None
-    cut_m: float = 0.0
-    form_is_sure: bool = True
+    edge: UpperEdge | None
+    standing_at_m: tuple[float, float] | None
+    cut_m: float
+    form_is_sure: bool
 
 
 class DepthJudge:
@@ -104,14 +105,14 @@ class DepthJudge:
     def __init__(self, view: View, blade: BladeGeometry, settings: DepthSettings, decision: DecisionSettings) -> None:
         self._settings = settings
         self._view = view
-        self._grids: OrderedDict[int, tuple[U8, tuple[int, ...]]] = OrderedDict()
+        self._grids: OrderedDict[int, tuple[Bools, list[int]]] = OrderedDict()
         self._decision = decision
         self._blade = blade
-        self._position = view.position_m.astype(np.float32)
         # The stride is meant for a picture 848 pixels across; a smaller one is sampled as densely on the ground.
         self._stride = max(1, round(settings.stride_px * view.lens.width / NOMINAL_WIDTH_PX))
         rays = view.rays(self._stride)
         self._rays = np.ascontiguousarray(rays.reshape(-1, 3).T) * np.float32(0.001)  # a millimetre of depth each
+        self._origins = view.position_m.astype(np.float32)[:, None] + self._rays
         self._ground = GroundFit(
             blade, view.position_m, settings.ground_offset_limit_m, settings.ground_slope_limit_deg
         )
@@ -129,43 +130,48 @@ class DepthJudge:
             self._cell_d_m * np.arange(0.5, columns_n, dtype=np.float64),
             self._cell_s_m * self._cell_d_m,
         )
+        self._soil_split = SoilSplit(self._cells, blade, settings.repose_deg, self._travel_m)
+        # How much steep soil, and soil at its angle of repose, rises from cell to cell.
+        self._steepest_m = math.tan(math.radians(settings.form.steepest_deg)) * self._cell_d_m
+        self._repose_m = math.tan(math.radians(settings.repose_deg)) * self._cell_d_m
         self._before = slice(self._beside_n, self._beside_n + self._along_n), slice(self._ahead_n)
 
     def height_map(self, depth_mm: DepthImage, stance: Stance) -> HeightMap:
         """Measure one depth picture (uint16, mm along the optical axis, 0 = no value)."""
         blade, angle_deg = self._blade, stance.angle_deg
         points = self._points(depth_mm)
-        ground = self._ground.fit(points[0], points[1], points[2], angle_deg)
+        ground = self._ground.fit(points, angle_deg)
         edge = self._finder.upper_edge(depth_mm, stance, ground)
         ground, cut_m = self._layer(ground, edge, stance)
-        s, d, z = self._in_blade(points, ground, angle_deg)
-        # Some way behind and beside the blade too, where its face is looked for.
-        wide = np.float32(blade.length_m / 2 + self._travel_m * BESIDE_RATIO)
-        pixels = np.flatnonzero((d > np.float32(-BEHIND_M)) & (d < np.float32(STANDING_REACH_M)) & (np.abs(s) < wide))
-        s, d, z, raw_z = s[pixels], d[pixels], z[pixels], points[2][pixels]
+        pixels, s, d, raw_z = self._near_blade(points, angle_deg)
+        z = ground.turned(angle_deg).above(d, s, raw_z)
+        d -= blade.x_offset_m
         above_edge = self._above_edge(s, z, raw_z, edge, stance)
-        lean = np.float32(stance.lean) * np.clip(above_edge, 0, np.float32(blade.height_m))
-        face = d + self._finder.setback(above_edge) - lean  # 0 on the face
+        face = self._finder.setback(above_edge)  # 0 on the face
+        face += d
+        if stance.lean:
+            face -= stance.lean * above_edge.clip(0, blade.height_m)
         low = z < self._settings.max_height_m
         fix = self._finder.find(s, face, above_edge, stance.tall_m(blade))
         if fix.seen == 0:
             fix = self._finder.displaced(depth_mm, stance)
         # Small rotation and shift of the blade against its calibrated place.
-        turn = np.float32(np.radians(fix.turn_deg))
-        moved = turn * s - np.float32(fix.ahead_m)
-        d, face = np.asarray(d + moved, dtype=np.float32), np.asarray(face + moved, dtype=np.float32)
-        s = np.asarray(s - np.float32(fix.along_m) - turn * d, dtype=np.float32)
+        turn = math.radians(fix.turn_deg)
+        moved = turn * s
+        moved -= fix.ahead_m
+        d += moved
+        face += moved
+        s -= turn * d
+        s -= fix.along_m
         stands = standing(s, d, z, blade.length_m / 2, STANDING_REACH_M)
-        low &= d < np.float32(blade.reach_m + CONTEXT_M)
-        valid = self._valid_shares(pixels[np.flatnonzero(low)], angle_deg)
-        in_front = np.flatnonzero(
-            low
-            & (face > np.float32(FACE_MARGIN_M))
-            & (d > 0)
-            & (np.abs(s) < np.float32(self._cells.s_m.size * self._cell_s_m / 2))
-        )
-        soil = self._map(s[in_front], d[in_front], z[in_front], ground, fix, valid, angle_deg)
-        return replace(soil, edge=edge, standing_at_m=stands, cut_m=cut_m)
+        low &= d < self._travel_m
+        valid = self._valid_shares(pixels, low, angle_deg)
+        low &= face > FACE_MARGIN_M
+        low &= d > 0
+        low &= np.abs(s) < self._cells.s_m.size * self._cell_s_m / 2
+        in_front = np.flatnonzero(low)
+        there = s.take(in_front), d.take(in_front), z.take(in_front)
+        return self._map(*there, ground, fix, valid, angle_deg, edge=edge, standing_at_m=stands, cut_m=cut_m)
 
     def _layer(self, ground: Ground, edge: UpperEdge | None, stance: Stance) -> tuple[Ground, float]:
         """The ground under a level layer of soil, and how far the edge is in the ground where nothing says why.
@@ -188,10 +194,10 @@ class DepthJudge:
     def _above_edge(self, s: F32, z: F32, raw_z: F32, edge: UpperEdge | None, stance: Stance) -> F32:
         """Heights above the cutting edge: below the upper edge where it was found, else as the lifts say."""
         if edge is None:
-            bottom = np.float32(stance.edge_m(self._blade))
-            return np.asarray(z - bottom - np.float32(stance.rise) * s, dtype=np.float32)
-        bottom = np.float32(edge.height_m - stance.tall_m(self._blade))
-        return np.asarray(raw_z - bottom - np.float32(edge.rise) * s, dtype=np.float32)
+            bottom = stance.edge_m(self._blade)
+            return np.asarray(z - bottom - stance.rise * s, dtype=np.float32)
+        bottom = edge.height_m - stance.tall_m(self._blade)
+        return np.asarray(raw_z - bottom - edge.rise * s, dtype=np.float32)
 
     def verdict(self, soil: HeightMap) -> Verdict:
         """Judge a height map."""
@@ -222,7 +228,7 @@ class DepthJudge:
                 f"the edge seems to be {soil.cut_m * 1000:.0f} mm in the ground: cut ground and a level layer of soil "
                 "look the same without a measured lift that agrees"
             )
-        raised_m = float(soil.ground.height_at(np.zeros(1), np.zeros(1))[0])
+        raised_m = soil.ground.offset_m
         if soil.edge is None and raised_m > SUNK_M:
             return verdict.unknown(
                 f"what looks like ground is {raised_m * 1000:.0f} mm higher than calibrated, and the blade's upper "
@@ -252,36 +258,45 @@ class DepthJudge:
         return verdict
 
     def _points(self, depth_mm: DepthImage) -> F32:
-        """Points in the vehicle frame of the sampled pixels (3 x N); NaN where one has no depth."""
+        """Points in the vehicle frame of the sampled pixels (3 x N); far away where one has no depth."""
         stride = self._stride
-        depth = depth_mm[stride // 2 :: stride, stride // 2 :: stride].ravel()
-        points: F32 = self._rays * np.where(depth, depth, np.float32(np.nan))
-        points += self._position[:, None]
+        # 0 less one is 65.5 m; the rays begin a millimetre from the camera instead.
+        depth = depth_mm[stride // 2 :: stride, stride // 2 :: stride] - np.uint16(1)
+        points: F32 = self._rays * depth.ravel().astype(np.float32)
+        points += self._origins
         return points
 
-    def _in_blade(self, points: F32, ground: Ground, angle_deg: float) -> tuple[F32, F32, F32]:
-        """Points in blade coordinates s and d, and their heights above the ground."""
-        x, y, z = points
-        angle = np.radians(angle_deg)
-        cos, sin = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-        s = y * cos - x * sin
-        d = x * cos + y * sin - np.float32(self._blade.x_offset_m)
-        return s, d, ground.above(x, y, z)
+    def _near_blade(self, points: F32, angle_deg: float) -> tuple[I64, F32, F32, F32]:
+        """Which points lie about the blade, and these: along it, ahead of its axis, and their heights.
 
-    def _valid_shares(self, pixels: I64, angle_deg: float) -> tuple[float, float, float]:
-        """Of the pixels on each third, the share among ``pixels``."""
+        Some way behind and beside it too, where its face is looked for.
+        """
+        cos, sin = cos_sin(angle_deg)
+        turned = np.array(((-sin, cos, 0.0), (cos, sin, 0.0), (0.0, 0.0, 1.0)), dtype=np.float32) @ points
+        near = turned[1] > self._blade.x_offset_m - BEHIND_M
+        near &= turned[1] < self._blade.x_offset_m + STANDING_REACH_M
+        near &= np.abs(turned[0]) < self._blade.length_m / 2 + self._travel_m * BESIDE_RATIO
+        pixels = np.flatnonzero(near)
+        s, ahead, z = turned.take(pixels, axis=1)
+        return pixels, s, ahead, z
+
+    def _valid_shares(self, pixels: I64, good: Bools, angle_deg: float) -> tuple[float, float, float]:
+        """Of the pixels on each third, the share that is among the ``good`` of ``pixels``."""
         step = round(angle_deg)
         if step not in self._grids:
             self._grids[step] = self._third_grid(step)
             if len(self._grids) > KEPT_GRIDS_N:
                 self._grids.popitem(last=False)
         thirds, totals = self._grids[step]
-        counts = np.bincount(thirds[pixels], minlength=4)
-        shares = [float(counts[third]) / totals[third] if totals[third] else 0.0 for third in range(3)]
-        return shares[0], shares[1], shares[2]
+        seen = np.zeros(thirds.shape[1], dtype=np.bool_)
+        seen[pixels] = good
+        left, center, right = (
+            np.count_nonzero(on_it & seen) / total_n for on_it, total_n in zip(thirds, totals, strict=True)
+        )
+        return left, center, right
 
-    def _third_grid(self, angle_deg: float) -> tuple[U8, tuple[int, ...]]:
-        """For each sampled pixel the third it lies on (3: none), and how many lie on each."""
+    def _third_grid(self, angle_deg: float) -> tuple[Bools, list[int]]:
+        """For each third the sampled pixels that lie on it, and how many these are, or 1 where there are none."""
         lens = self._view.lens
         rows, columns = (len(range(self._stride // 2, side, self._stride)) for side in (lens.height, lens.width))
         grid = np.full((rows, columns), 3, dtype=np.uint8)
@@ -289,45 +304,50 @@ class DepthJudge:
             if np.isfinite(outline).all():
                 places = (outline - self._stride // 2) / self._stride
                 cv2.fillPoly(grid, [np.round(places * (1 << 4)).astype(np.int32)], third, shift=4)
-        return grid.ravel(), tuple(int(n) for n in np.bincount(grid.ravel(), minlength=4))
+        on_each = grid.ravel() == np.arange(3)[:, None]
+        return on_each, np.maximum(on_each.sum(axis=1), 1).tolist()
 
     def _noise_m(self, ground: Ground, angle_deg: float) -> F64:
         """The noise of heights in each cell: it grows with the square of the distance, as disparity has it."""
-        angle = np.radians(angle_deg)
-        x, y, z = self._view.position_m
-        s, d = y * np.cos(angle) - x * np.sin(angle), x * np.cos(angle) + y * np.sin(angle) - self._blade.x_offset_m
-        square_m2 = (self._cells.s_m[:, None] - s) ** 2 + (self._cells.d_m[None, :] - d) ** 2 + z**2
+        cos, sin = cos_sin(angle_deg)
+        x, y, z = self._view.pose.position_m
+        s, d = y * cos - x * sin, x * cos + y * sin - self._blade.x_offset_m
+        square_m2 = np.add.outer((self._cells.s_m - s) ** 2 + z**2, (self._cells.d_m - d) ** 2)
         return np.asarray(ground.noise_m_per_m2 * square_m2, dtype=np.float64)
 
-    def _map(self, s: F32, d: F32, z: F32, ground: Ground, fix: BladeFix, valid: Litres, angle_deg: float) -> HeightMap:
+    def _map(
+        self, s: F32, d: F32, z: F32, ground: Ground, fix: BladeFix, valid: Litres, angle_deg: float,
+        *, edge: UpperEdge | None, standing_at_m: tuple[float, float] | None, cut_m: float,
+    ) -> HeightMap:  # fmt: skip
         settings = self._settings
         along_n = self._cells.s_m.size
-        half = np.float32(along_n * self._cell_s_m / 2)
+        half = along_n * self._cell_s_m / 2
         noise_m = self._noise_m(ground, angle_deg)
         ahead_n = self._ahead_n + self._context_n
-        i = np.minimum(((s + half) * np.float32(1 / self._cell_s_m)).astype(np.int32), along_n - 1)
-        j = np.minimum((d * np.float32(1 / self._cell_d_m)).astype(np.int32), ahead_n - 1)
-        flat = i * ahead_n + j
+        i = ((s + half) / self._cell_s_m).astype(np.intp)
+        j = (d / self._cell_d_m).astype(np.intp)
+        np.minimum(i, along_n - 1, out=i)
+        i *= ahead_n
+        i += np.minimum(j, ahead_n - 1, out=j)
         shape = (along_n, ahead_n)
-        size = along_n * ahead_n
-        count = np.bincount(flat, minlength=size)
+        count = np.bincount(i, minlength=along_n * ahead_n).reshape(shape)
+        total = np.bincount(i, weights=z, minlength=count.size).reshape(shape)
+        squares = np.bincount(i, weights=np.square(z, dtype=np.float64), minlength=count.size).reshape(shape)
         seen = count > 0
-        n = np.maximum(count, 1)
-        height = np.bincount(flat, weights=z, minlength=size) / n
-        square: F64 = np.maximum(np.bincount(flat, weights=z * z, minlength=size) / n - height**2, 0.0) * count
-        seen, height = seen.reshape(shape), height.reshape(shape)
+        height = np.asarray(total / np.maximum(count, 1), dtype=np.float64)
         form = settings.form
-        slope = np.tan(np.radians((form.steepest_deg, settings.repose_deg))) * self._cell_d_m
-        spread, hanging = steep_cells(square.reshape(shape), count.reshape(shape), noise_m, form)
-        high = above_neighbours(height, seen & ~hanging, float(slope[0]))
-        above = seen & ~hanging & (high >= HANGS_M)
-        seen &= ~hanging & ~above
+        spread, hanging = steep_cells(squares - total * height, count, noise_m, form)
+        seen &= ~hanging
+        high = above_neighbours(height, seen, self._steepest_m)
+        above = seen & (high >= HANGS_M)
+        seen ^= above
         steep = seen & (spread | (high > STEEP_TOLERANCE_M))
         good = seen & ~steep
         # What touches the face hides in the face's own margin: soil goes on to it as high as it is just before.
         touching = good[:, 1] & ~good[:, 0]
-        height[touching, 0], good[touching, 0] = height[touching, 1], True
-        filled = fill_hidden(height, good, float(slope[1]), float(slope[0]))
+        np.copyto(height[:, 0], height[:, 1], where=touching)
+        good[:, 0] |= touching
+        filled = fill_hidden(height, good, self._repose_m, self._steepest_m)
         threshold = max(settings.min_height_m, settings.noise_factor_ratio * ground.residual_m)
         forms = sort_out(height, filled, seen, steep, above, ground.residual_m, threshold, form)
         volumes_l, carried_l, ahead_l = self._split(filled, forms.soil, angle_deg + fix.turn_deg)
@@ -349,28 +369,31 @@ class DepthJudge:
             ground,
             fix,
             angle_deg + fix.turn_deg,
+            edge,
+            standing_at_m,
+            cut_m,
             form_is_sure=not bool((noise_m[forms.things] * SLOPE_NOISE_RATIO > form.steep_spread_m).any()),
         )
 
     def _split(self, height: F64, where: Bools, angle_deg: float) -> tuple[Litres, Litres, Litres]:
         """Litres per third of the map's cells ``where``: all before the blade, carried by it, and ahead of it."""
-        soil = np.where(where, np.maximum(height, 0.0), 0.0)
+        soil = np.maximum(height * where, 0.0)
         meeting_deg = min(max(angle_deg, -STEEPEST_MEETING_DEG), STEEPEST_MEETING_DEG)
-        repose_deg = self._settings.repose_deg
-        carried_l, ahead_l = split_soil(soil, self._cells, meeting_deg, self._blade, repose_deg, self._travel_m)
+        carried_l, ahead_l = self._soil_split(soil, meeting_deg)
         all_l, hollow_l = self._litres(height, where)
         return all_l, _plus(carried_l, hollow_l), ahead_l
 
     def _litres(self, height: F64, where: Bools) -> tuple[Litres, Litres]:
         """Litres per third of the map's cells ``where``; and what of it lies in the hollow of the face."""
+        where = where[self._before]
         if not where.any():
             return NOTHING, NOTHING
-        ahead = np.where(where, height, 0.0)[self._before]
+        ahead = height[self._before] * where
         hollow = self._finder.hollow_m2(ahead[:, 0])
-        both = np.stack((ahead.sum(axis=1) * self._cell_d_m + hollow, hollow))
-        thirds = np.maximum(both.reshape(2, 3, -1).sum(axis=2) * self._cell_s_m * 1000.0, 0.0).tolist()
-        (right, center, left), (behind_right, behind_center, behind_left) = thirds  # along growing s
-        return (left, center, right), (behind_left, behind_center, behind_right)
+        both = np.array((ahead.sum(axis=1) * self._cell_d_m + hollow, hollow))
+        thirds = both.reshape(2, 3, -1).sum(axis=2) * (self._cell_s_m * 1000.0)
+        (right, center, left), (behind_right, behind_center, behind_left) = np.maximum(thirds, 0.0).tolist()
+        return (left, center, right), (behind_left, behind_center, behind_right)  # s grows from right to left
 
 
 def _plus(one: Litres, other: Litres) -> Litres:
@@ -387,8 +410,6 @@ CREST_M = 0.06
 PLACES_N = 5
 """The three thirds, and what lies beyond either end."""
 
-ThirdsL = tuple[float, float, float]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
@@ -399,40 +420,60 @@ class Cells:
     area_m2: float
 
 
-def split_soil(
-    height_m: F64, cells: Cells, angle_deg: float, blade: BladeGeometry, repose_deg: float, travel_m: float
-) -> tuple[ThirdsL, ThirdsL]:
-    """Litres carried, and litres ahead (left, center, right each) of a map of soil heights (0 where there is none).
+class SoilSplit:
+    """Tells soil that the blade carries from soil that lies ahead of it.
 
     The map's rows may go on beyond the blade's ends: with the blade turned, what its leading end will meet lies there.
     Carried: under the slope at ``repose_deg`` from the crest at the face, by the third it lies before. Ahead: what
     stands above that slope, by the third that will meet it within ``travel_m`` of travel.
-
-    Raises:
-        ValueError: the blade is turned too far to meet anything.
     """
-    slope = np.tan(np.radians(repose_deg))
-    # The slope goes through the crest. Where soil rises towards one, the face behind it was seen lower, or not at all.
-    near = cells.d_m < CREST_M
-    climb = np.clip(height_m[:, near] - height_m[:, :1], 0.0, slope * cells.d_m[near])
-    rise = height_m + slope * cells.d_m
-    rise[:, near] = (height_m[:, near] + climb).max(axis=1, keepdims=True)
-    carried = np.clip(np.minimum.accumulate(rise, axis=1) - slope * cells.d_m, 0.0, height_m)
-    carried[np.abs(cells.s_m) > blade.length_m / 2] = 0.0  # nothing to lean on
-    met_s, met_m = meeting_point(cells.s_m[:, None], cells.d_m[None, :], angle_deg)
-    met = _third(met_s, blade)
-    met[np.broadcast_to(met_m > travel_m, met.shape)] = 0
-    litres = 1000.0 * cells.area_m2
-    leaning = np.bincount(_third(cells.s_m, blade), weights=carried.sum(axis=1), minlength=PLACES_N) * litres
-    coming = np.bincount(met.ravel(), weights=(height_m - carried).ravel(), minlength=PLACES_N) * litres
-    return _inner(leaning), _inner(coming)
+
+    def __init__(self, cells: Cells, blade: BladeGeometry, repose_deg: float, travel_m: float) -> None:
+        self._cells, self._blade, self._travel_m = cells, blade, travel_m
+        self._drop_m = math.tan(math.radians(repose_deg)) * cells.d_m
+        self._crest_n = int(np.count_nonzero(cells.d_m < CREST_M))
+        self._thirds = self._third(cells.s_m)
+        self._beside = np.abs(cells.s_m) > blade.length_m / 2
+        self._met: tuple[float, I64] = (math.nan, self._thirds)
+
+    def __call__(self, height_m: F64, angle_deg: float) -> tuple[Litres, Litres]:
+        """Litres carried, and litres ahead, of a map of soil heights (0 where there is none).
+
+        Raises:
+            ValueError: the blade is turned too far to meet anything.
+        """
+        if self._met[0] != angle_deg:
+            self._met = angle_deg, self._meeting(angle_deg)
+        # The slope goes through the crest. Where soil rises towards one, the face behind was seen lower, or not at all.
+        crest = height_m[:, : self._crest_n]
+        climb = np.maximum(crest - height_m[:, :1], 0.0)
+        rise = height_m + self._drop_m
+        top = crest + np.minimum(climb, self._drop_m[: self._crest_n])
+        rise[:, : self._crest_n] = top.max(axis=1, keepdims=True)
+        carried = np.minimum.accumulate(rise, axis=1)
+        carried -= self._drop_m
+        np.clip(carried, 0.0, height_m, out=carried)
+        carried[self._beside] = 0.0  # nothing to lean on
+        litres = 1000.0 * self._cells.area_m2
+        leaning = np.bincount(self._thirds, weights=carried.sum(axis=1), minlength=PLACES_N) * litres
+        coming = np.bincount(self._met[1], weights=(height_m - carried).ravel(), minlength=PLACES_N) * litres
+        return _inner(leaning), _inner(coming)
+
+    def _meeting(self, angle_deg: float) -> I64:
+        """The third that will meet each cell of the map, and 0 for what is met by none within the travel."""
+        met_s, met_m = meeting_point(self._cells.s_m[:, None], self._cells.d_m, angle_deg)
+        met = self._third(met_s)
+        met[:, met_m > self._travel_m] = 0
+        return met.ravel()
+
+    def _third(self, s_m: F64) -> I64:
+        """1, 2, 3 for the left, center and right third in which places lie; 0 and 4 for what lies beyond the ends."""
+        place = s_m * (-3.0 / self._blade.length_m)
+        place += 2.5
+        return np.clip(place, 0.0, 4.0, out=place).astype(np.intp)
 
 
-def _third(s_m: F64, blade: BladeGeometry) -> I64:
-    """1, 2, 3 for the left, center and right third in which places lie; 0 and 4 for what lies beyond the ends."""
-    return np.clip(np.floor(s_m * (-3.0 / blade.length_m) + 2.5), 0.0, 4.0).astype(np.intp)
-
-
-def _inner(amounts: npt.NDArray[np.floating]) -> ThirdsL:
+def _inner(amounts: npt.NDArray[np.floating]) -> Litres:
     """Without what lies beyond either end."""
-    return float(amounts[1]), float(amounts[2]), float(amounts[3])
+    _, left, center, right, *_ = amounts.tolist()
+    return left, center, right

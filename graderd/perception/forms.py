@@ -8,6 +8,7 @@ one with a large smooth core is soil, with something on it or across it. This is
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from graderd.perception.geometry import F32, F64
+from graderd.perception.geometry import F32, F64, U8
 from graderd.perception.settings import FormSettings
 
 Bools = npt.NDArray[np.bool_]
@@ -23,6 +24,8 @@ Counts = npt.NDArray[np.integer[Any]]
 
 UNSEEN = 10.0
 """Stands for a height that is not known, metres."""
+SPAN_M = 0.5
+"""A cone is followed until it has risen so far: heights in a map differ by less."""
 STEEP_TOLERANCE_M = 0.02
 """So far above what could rise there a cell is steep: the noise of a cell's mean is 2 to 6 mm."""
 OWN_SPREAD_M = 0.020
@@ -59,7 +62,8 @@ TALL_M = 0.03
 """Cells lower than this say nothing about form: their steepness drowns in noise."""
 FOOT_CELLS_N = 3
 """A heap's foot runs out below the level at which lumps are told apart: so many cells more count."""
-CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+CROSS = np.asarray(cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)), dtype=np.uint8)
+SQUARE = np.ones((3, 3), dtype=np.uint8)
 ENDS_LEAST_N = 6
 """Where fewer cells show how a lump ends, as between the blade's face and a heap, nothing is said by it."""
 BESIDE_CELLS_N = 2
@@ -84,38 +88,60 @@ def sort_out(
     """Sort a height map into soil, things and ground.
 
     ``height`` of the ``seen`` cells and of those that are far ``above`` their neighbours, ``filled``: of the seen ones
-    without the steep cells, and with what is hidden guessed.
+    without the steep cells (which are seen ones), and with what is hidden guessed.
     ``stands_out_m``: what soil must rise above the ground somewhere.
     """
     surface = np.where(seen, height, filled)
     low_m = max(settings.lowest_m, 2.0 * residual_m)
-    count, labels = cv2.connectedComponents((surface > low_m).astype(np.uint8), connectivity=4)
-    size = 2 * BESIDE_CELLS_N + 1
-    beside = cv2.dilate((steep & seen).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    count, labels = cv2.connectedComponents((surface > low_m).view(np.uint8), connectivity=4)
     tall = seen & (height > TALL_M)
-    flat = np.asarray(labels.ravel(), dtype=np.intp)
-    tall_n = np.bincount(flat, weights=tall.ravel(), minlength=count)
-    core_n = np.bincount(flat, weights=(tall & ~beside).ravel(), minlength=count)
-    steep_n = np.bincount(flat, weights=(tall & steep).ravel(), minlength=count)
-    core = np.divide(core_n, tall_n, out=np.ones(count), where=tall_n > 0)
-    is_thing = (core * 100.0 < settings.thing_core_percent) & (steep_n > 0)
     # Soil runs out into the ground, wherever that is seen beside it. A box or a slab ends all round in a step.
-    ends = tall & (cv2.dilate((seen & ~tall).astype(np.uint8), CROSS) > 0)
-    rim = above & (height < cv2.dilate(np.where(tall, height, 0.0), CROSS) + LEVEL_M)  # what hangs over it is higher
-    ends_n = np.bincount(flat, weights=(ends | rim).ravel(), minlength=count)
-    steps_n = np.bincount(flat, weights=((ends & steep) | rim).ravel(), minlength=count)
-    is_thing |= (ends_n >= ENDS_LEAST_N) & (steps_n * 100.0 > settings.thing_steps_percent * ends_n)
+    ends = tall & _dilated(seen & ~tall, CROSS)
+    rim = above
+    if above.any():  # what hangs over it is higher
+        rim = above & (height < cv2.dilate(np.where(tall, height, 0.0), CROSS) + LEVEL_M)
+    clear = tall & ~_dilated(steep, np.ones((2 * BESIDE_CELLS_N + 1,) * 2, np.uint8))
     high = cv2.blur(filled, (3, 3)) > stands_out_m
-    is_thing[0] = False
-    stands = (np.bincount(flat, weights=high.ravel(), minlength=count) > 0) & ~is_thing
-    stands[0] = False
-    weak = ~stands & ~is_thing
-    weak[0] = False
-    soil, things = stands[labels], is_thing[labels]
-    foot = cv2.dilate(soil.astype(np.uint8), np.ones((2 * FOOT_CELLS_N + 1,) * 2, np.uint8)) > 0
-    soil = foot & ~things & ~weak[labels]
-    touched = cv2.dilate((steep & seen).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return Forms(soil, soil & touched, things, weak[labels])
+    lump = np.asarray(labels, dtype=np.intp)
+    tall_n, core_n, steep_n, ends_n, steps_n, high_n = _counts(
+        lump, count, (tall, clear, tall & steep, ends | rim, (ends & steep) | rim, high)
+    )
+    is_thing = (core_n * 100.0 < settings.thing_core_percent * tall_n) & (steep_n > 0)
+    is_thing |= (ends_n >= ENDS_LEAST_N) & (steps_n * 100.0 > settings.thing_steps_percent * ends_n)
+    stands = (high_n > 0) & ~is_thing
+    is_weak = ~stands & ~is_thing
+    is_thing[0] = stands[0] = is_weak[0] = False  # the ground
+    things, weak = is_thing.take(lump), is_weak.take(lump)
+    foot = _dilated(stands.take(lump), np.ones((2 * FOOT_CELLS_N + 1,) * 2, np.uint8))
+    soil = foot & ~things & ~weak
+    return Forms(soil, soil & _dilated(steep, SQUARE), things, weak)
+
+
+def _dilated(where: Bools, kernel: U8) -> Bools:
+    return np.asarray(cv2.dilate(where.view(np.uint8), kernel)).view(np.bool_)
+
+
+def _counts(lump: npt.NDArray[np.intp], count: int, facts: tuple[Bools, ...]) -> F64:
+    """Of how many cells of each lump each fact is true: a row a fact.
+
+    The facts of a cell make one number, so that one pass counts them all.
+    """
+    held = facts[-1].astype(np.uint8)
+    for fact in facts[-2::-1]:
+        held <<= 1
+        held |= fact
+    numbers_n = 1 << len(facts)
+    index = lump * numbers_n
+    index += held
+    found = np.bincount(index.ravel(), minlength=count * numbers_n).reshape(count, numbers_n)
+    return np.asarray(_holds(len(facts)) @ found.T.astype(np.float64))
+
+
+@functools.cache
+def _holds(facts_n: int) -> F64:
+    """Which of so many facts each number stands for: 1 where it holds one, a row a fact."""
+    holds = (np.arange(1 << facts_n) >> np.arange(facts_n)[:, None]) & 1
+    return holds.astype(np.float64)
 
 
 def steep_cells(square_m2: F64, count: Counts, noise_m: F64, settings: FormSettings) -> tuple[Bools, Bools]:
@@ -125,20 +151,19 @@ def steep_cells(square_m2: F64, count: Counts, noise_m: F64, settings: FormSetti
     of heights there. A cell holds a few points only, so that five in a row are judged together, along s and along d:
     a pipe is steep along one of them.
     """
-    freedom = np.maximum(count - 1, 0).astype(np.float64)
-    variance = np.divide(square_m2, freedom, out=np.zeros(square_m2.shape), where=freedom > 0)
-    hanging = variance > GAP_SPREAD_M**2
+    freedom = np.maximum(count - 1, 0).astype(np.float64)  # the variance is the squares over this
+    several = freedom > 0
+    hanging = several & (square_m2 > GAP_SPREAD_M**2 * freedom)
     freedom[hanging] = 0.0
     # One cell of a hose must not make its neighbours steep.
-    capped = np.minimum(variance, OWN_SPREAD_M**2) * freedom
-    pooled = np.zeros(variance.shape)
+    capped = np.minimum(square_m2, OWN_SPREAD_M**2 * freedom)
+    limit = settings.steep_spread_m**2 + (SLOPE_NOISE_RATIO * noise_m) ** 2
+    steep = square_m2 > (OWN_SPREAD_M**2 + limit) * freedom
     for row in ((ROW_CELLS_N, 1), (1, ROW_CELLS_N)):
         points = cv2.boxFilter(freedom, -1, row, normalize=False)
         squares = cv2.boxFilter(capped, -1, row, normalize=False)
-        pooled = np.maximum(pooled, np.divide(squares, points, out=np.zeros(pooled.shape), where=points > 0.5))
-    limit = settings.steep_spread_m**2 + (SLOPE_NOISE_RATIO * noise_m) ** 2
-    steep = ((pooled > limit) | (variance > OWN_SPREAD_M**2 + limit)) & (freedom > 0)
-    return np.asarray(steep), np.asarray(hanging)
+        steep |= squares > limit * points
+    return np.asarray(steep & several & ~hanging), np.asarray(hanging)
 
 
 def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[float, float] | None:
@@ -148,15 +173,16 @@ def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[flo
     )
     columns_n, rows_n = int(2 * half_m / CELL_M) + 1, int(reach_m / CELL_M) + 1
     levels_n = round((HIGHEST_M - LOWEST_M) / LEVEL_M) + 1
-    i = ((s[inside] + np.float32(half_m)) * np.float32(1 / CELL_M)).astype(np.int32)
-    j = (d[inside] * np.float32(1 / CELL_M)).astype(np.int32)
-    k = ((z[inside] - np.float32(LOWEST_M)) * np.float32(1 / LEVEL_M)).astype(np.int32)
-    column = i * rows_n + j
-    counts = np.bincount(column * levels_n + k, minlength=columns_n * rows_n * levels_n).reshape(-1, levels_n)
-    # Few columns reach so high as to hold a run.
-    high = np.flatnonzero(np.bincount(column[k >= LEVELS_N - 1], minlength=len(counts)) >= LEVEL_POINTS_N)
-    if high.size < STANDING_COLUMNS_N:
+    index = ((s.take(inside) + half_m) / CELL_M).astype(np.intp)
+    index *= rows_n
+    index += (d.take(inside) / CELL_M).astype(np.intp)
+    index *= levels_n
+    index += ((z.take(inside) - LOWEST_M) / LEVEL_M).astype(np.intp)
+    counts = np.bincount(index, minlength=columns_n * rows_n * levels_n).reshape(-1, levels_n)
+    # A run that begins low enough goes through this level, and few columns reach it.
+    if np.count_nonzero(counts[:, ON_SOIL_STARTS_N - 1] >= LEVEL_POINTS_N) < STANDING_COLUMNS_N:
         return None
+    high = np.flatnonzero(counts[:, LEVELS_N - 1 :].max(axis=1) >= LEVEL_POINTS_N)
     there = counts[high] >= LEVEL_POINTS_N
     runs = there[:, : 1 - LEVELS_N].copy()
     for level in range(1, LEVELS_N):
@@ -172,7 +198,7 @@ def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[flo
     found = [
         at
         for at, start in zip(places, starts, strict=True)
-        if start < LOW_STARTS_N or start <= min(_level(levels, upright, at) + 2, ON_SOIL_STARTS_N - 1)
+        if start < LOW_STARTS_N or (start < ON_SOIL_STARTS_N and start <= _level(levels, upright, at) + 2)
     ]
     if len(found) < STANDING_COLUMNS_N:
         return None
@@ -204,16 +230,18 @@ def fill_hidden(height: F64, seen: Bools, drop_per_cell: float, aside_per_cell: 
     return np.where(seen, height, np.maximum(least, 0.0))
 
 
-def _lower_cones(height: F64, rise_s_per_cell: float, rise_d_per_cell: float) -> F64:
+def _lower_cones(height: F64, rise_s_per_cell: float, rise_d_per_cell: float) -> F32:
     """The lower envelope of upward cones standing on every cell, of these slopes along s and d.
 
-    Distances run along the two directions of the cells, so that four accumulations give it.
+    Distances run along the two directions of the cells; each round looks twice as far as the one before.
     """
-    for axis, rise_per_cell in enumerate((rise_s_per_cell, rise_d_per_cell)):
-        steps = rise_per_cell * np.arange(height.shape[axis])
-        steps = steps[:, None] if axis == 0 else steps[None, :]
-        back = np.s_[::-1] if axis == 0 else np.s_[:, ::-1]
-        up = np.minimum.accumulate(height - steps, axis=axis) + steps
-        down = np.minimum.accumulate((height + steps)[back], axis=axis)[back] - steps
-        height = np.minimum(up, down)
-    return height
+    lower = height.astype(np.float32)
+    risen = np.empty_like(lower)
+    for cells, up, rise_per_cell in ((lower, risen, rise_s_per_cell), (lower.T, risen.T, rise_d_per_cell)):
+        far_n = 1
+        while far_n < len(cells) and far_n * rise_per_cell < SPAN_M:
+            np.add(cells, far_n * rise_per_cell, out=up)
+            np.minimum(cells[far_n:], up[:-far_n], out=cells[far_n:])
+            np.minimum(cells[:-far_n], up[far_n:], out=cells[:-far_n])
+            far_n *= 2
+    return lower

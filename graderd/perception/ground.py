@@ -8,13 +8,14 @@ does not stand out of it cannot be told from ground.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from graderd.core.blade import BladeGeometry, blade_coordinates
-from graderd.perception.geometry import F32, F64, middle
+from graderd.perception.geometry import F32, F64, cos_sin, middle
 
 CELL_M = 0.08
 """Ground is judged in cells of this size: a dozen points each, and a heap's side spreads in it more than noise."""
@@ -59,6 +60,8 @@ CURVATURE_SIGMA_PER_M = 0.08
 """Curvature that ground plausibly has: 30 mm over 0.6 m."""
 MIN_RING_N = 25
 """Four times as many cells as a surface of second order has numbers; with fewer the plane is kept."""
+SURFACE_PRIOR = np.diag((OFFSET_PULL, SLOPE_PULL, SLOPE_PULL, *[(SURFACE_SIGMA_M / CURVATURE_SIGMA_PER_M) ** 2] * 3))
+"""How firmly the surface is held to the plane."""
 REWEIGHED_N = 4
 """After so many rounds the weights stand still to a hundredth."""
 SIGMA_OF_MEDIAN = 1.4826
@@ -84,27 +87,40 @@ class Ground:
 
     def slope_deg(self) -> float:
         """Angle between this surface at the blade's axis and the calibrated ground."""
-        return float(np.degrees(np.arctan(np.hypot(self.slope_x, self.slope_y))))
+        return math.degrees(math.atan(math.hypot(self.slope_x, self.slope_y)))
 
     def height_at(self, x_m: F64, y_m: F64) -> F64:
         """Heights of the surface at places."""
         bend = self.bend_xx_per_m * x_m**2 + self.bend_xy_per_m * x_m * y_m + self.bend_yy_per_m * y_m**2
         return np.asarray(self.offset_m + self.slope_x * x_m + self.slope_y * y_m + bend, dtype=np.float64)
 
+    def turned(self, angle_deg: float) -> Ground:
+        """The same surface over axes that are turned counter-clockwise by an angle: along a blade, x ahead of it."""
+        cos, sin = cos_sin(angle_deg)
+        xx, xy, yy = self.bend_xx_per_m, self.bend_xy_per_m, self.bend_yy_per_m
+        return Ground(
+            self.offset_m,
+            self.slope_x * cos + self.slope_y * sin,
+            self.slope_y * cos - self.slope_x * sin,
+            xx * cos**2 + xy * cos * sin + yy * sin**2,
+            xy * (cos**2 - sin**2) + 2 * (yy - xx) * cos * sin,
+            xx * sin**2 - xy * cos * sin + yy * cos**2,
+            self.residual_m,
+            self.noise_m_per_m2,
+        )
+
     def above(self, x: F32, y: F32, z: F32) -> F32:
         """Heights above the surface."""
-        a, b, c, d, e, f = (
-            np.float32(value)
-            for value in (
-                self.offset_m,
-                self.slope_x,
-                self.slope_y,
-                self.bend_xx_per_m,
-                self.bend_xy_per_m,
-                self.bend_yy_per_m,
-            )
-        )
-        return np.asarray(z - a - x * (b + d * x + e * y) - y * (c + f * y), dtype=np.float32)
+        along_x = self.bend_xx_per_m * x
+        along_x += self.bend_xy_per_m * y
+        along_x += self.slope_x
+        along_x *= x
+        along_y = self.bend_yy_per_m * y
+        along_y += self.slope_y
+        along_y *= y
+        along_x += along_y
+        along_x += self.offset_m
+        return np.asarray(z - along_x, dtype=np.float32)
 
 
 class GroundFit:
@@ -121,113 +137,124 @@ class GroundFit:
         self._columns = round((y1 - y0) / CELL_M)
         self._rows = round((x1 - x0) / CELL_M)
 
-    def fit(self, x: F32, y: F32, z: F32, angle_deg: float) -> Ground:
-        """Surface through the ground points among ``x, y, z`` (vehicle frame, m), the blade standing at an angle."""
-        cx, cy, cz, spread = self._cells(x[::2], y[::2], z[::2])  # half of the points are plenty
+    def fit(self, points: F32, angle_deg: float) -> Ground:
+        """Surface through the ground points among ``points`` (3 x N, vehicle frame, m), the blade standing at an angle.
+
+        Points that are far away count as none.
+        """
+        x, y, z, spread = self._cells(np.ascontiguousarray(points[:, ::2]))  # half of the points are plenty
         flat = spread < CELL_FLAT_M
-        if flat.sum() < MIN_CELLS_N:
+        if np.count_nonzero(flat) < MIN_CELLS_N:
             return Ground()
-        plane = self._plane(cx[flat], cy[flat], cz[flat])
+        plane = self._plane(np.stack((np.ones(x.size), x, y)).compress(flat, axis=1), z.compress(flat))
         if plane is None:
             return Ground()
-        return self._surface(Ground(*plane), cx, cy, cz, spread, angle_deg)
+        return self._surface(plane, x, y, z, spread, angle_deg)
 
-    def _plane(self, cx: F64, cy: F64, cz: F64) -> tuple[float, float, float] | None:
-        a = np.column_stack((np.ones_like(cx), cx, cy))
-        few = max(1, cx.size // VOTERS_N)
-        plane = self._vote(a[::few], cz[::few])
+    def _plane(self, a: F64, z: F64) -> Ground | None:
+        """The plane on which most cells lie; ``a``: 1, x and y of each."""
+        few = max(1, z.size // VOTERS_N)
+        plane = self._vote(a[1:, ::few], z[::few])
         for width in (2.0 * INLIER_M, INLIER_M):
-            near = np.abs(cz - a @ plane) < width
-            if near.sum() < MIN_CELLS_N:
+            near = np.abs(z - plane @ a) < width
+            if np.count_nonzero(near) < MIN_CELLS_N:
                 return None
-            pull = np.diag((0.0, SLOPE_PULL, SLOPE_PULL))
-            on_it = a[near]
-            plane = _solve(on_it.T @ on_it + pull, on_it.T @ cz[near])
-        offset_m, slope_x, slope_y = plane.tolist()
-        return offset_m, slope_x, slope_y
+            on_it = a * near
+            normal = on_it @ a.T
+            normal[1, 1] += SLOPE_PULL
+            normal[2, 2] += SLOPE_PULL
+            plane = _solve(normal, on_it @ z)
+        return Ground(*plane.tolist())
 
-    def _surface(self, plane: Ground, cx: F64, cy: F64, cz: F64, spread: F64, angle_deg: float) -> Ground:
-        s, d = blade_coordinates(cx, cy, angle_deg)
+    def _surface(self, plane: Ground, x: F64, y: F64, z: F64, spread: F64, angle_deg: float) -> Ground:
+        s, d = blade_coordinates(x, y, angle_deg)
         d -= self._blade.x_offset_m
         half, reach = self._blade.length_m / 2 + CLEAR_M, self._blade.reach_m + CLEAR_M
-        zone = (np.abs(s) < half) & (d > -CLEAR_M) & (d < reach)
-        far = np.hypot(cx, cy) > NEAR_M
-        off = _about(plane, cx, cy, cz)
-        ground = ~zone & (np.abs(off) < SURFACE_BAND_M) & (spread < CELL_FLAT_M)
-        ring = ground & ~far
-        if ring.sum() < MIN_RING_N:
+        off = z - plane.offset_m - plane.slope_x * x - plane.slope_y * y
+        ground = (np.abs(s) > half) | (d < -CLEAR_M) | (d > reach)
+        ground &= np.abs(off) < SURFACE_BAND_M
+        ground &= spread < CELL_FLAT_M
+        ring = ground & (x * x + y * y < NEAR_M**2)
+        if np.count_nonzero(ring) < MIN_RING_N:
             ring = ground
-        if ring.sum() < MIN_RING_N:
+        if np.count_nonzero(ring) < MIN_RING_N:
             noise = middle(spread)
-            return replace(plane, residual_m=noise, noise_m_per_m2=self._per_square(noise, cx, cy))
-        x, y, rest = cx[ring], cy[ring], off[ring]
-        a = np.column_stack((np.ones_like(x), x, y, x * x, x * y, y * y))
-        bend: F64 = np.zeros(a.shape[1])
-        prior = np.diag((OFFSET_PULL, SLOPE_PULL, SLOPE_PULL, *[(SURFACE_SIGMA_M / CURVATURE_SIGMA_PER_M) ** 2] * 3))
+            return replace(plane, residual_m=noise, noise_m_per_m2=self._per_square(noise, x, y))
+        x, y, rest = x[ring], y[ring], off[ring]
+        a = np.stack((np.ones(x.size), x, y, x * x, x * y, y * y))
+        left = rest
         for _ in range(REWEIGHED_N):
-            weight = 1.0 / (1.0 + ((rest - a @ bend) / SURFACE_SIGMA_M) ** 2)
-            weighed = a * weight[:, None]
-            bend = _solve(a.T @ weighed + prior, weighed.T @ rest)
-        uneven = SIGMA_OF_MEDIAN * middle(np.abs(rest - a @ bend))
+            weighed = a / (1.0 + (left / SURFACE_SIGMA_M) ** 2)
+            bend = _solve(weighed @ a.T + SURFACE_PRIOR, weighed @ rest)
+            left = rest - bend @ a
+        uneven = SIGMA_OF_MEDIAN * middle(np.abs(left))
         noise = middle(spread[ring])
         offset_m, slope_x, slope_y, bend_xx, bend_xy, bend_yy = bend.tolist()
-        return replace(
-            plane,
-            offset_m=plane.offset_m + offset_m,
-            slope_x=plane.slope_x + slope_x,
-            slope_y=plane.slope_y + slope_y,
-            bend_xx_per_m=bend_xx,
-            bend_xy_per_m=bend_xy,
-            bend_yy_per_m=bend_yy,
-            residual_m=float(np.hypot(uneven, noise)),
-            noise_m_per_m2=self._per_square(noise, cx[ring], cy[ring]),
+        return Ground(
+            plane.offset_m + offset_m,
+            plane.slope_x + slope_x,
+            plane.slope_y + slope_y,
+            bend_xx,
+            bend_xy,
+            bend_yy,
+            residual_m=math.hypot(uneven, noise),
+            noise_m_per_m2=self._per_square(noise, x, y),
         )
 
     def _per_square(self, noise_m: float, x: F64, y: F64) -> float:
         eye_x, eye_y, eye_z = self._eye_m
         return noise_m / middle((x - eye_x) ** 2 + (y - eye_y) ** 2 + eye_z**2)
 
-    def _cells(self, x: F32, y: F32, z: F32) -> tuple[F64, F64, F64, F64]:
+    def _cells(self, points: F32) -> tuple[F64, F64, F64, F64]:
         """Mean place, mean height and spread of height of the cells that hold points near the calibrated ground."""
+        x, y, z = points
         x0, x1, _, y1 = EXTENT_M
-        take = np.flatnonzero((np.abs(z) < BAND_M + BAND_SLOPE * np.abs(x)) & (x > x0) & (np.abs(y) < y1) & (x < x1))
-        x, y, z = x[take], y[take], z[take]
-        cell = ((x - np.float32(x0)) * np.float32(1 / CELL_M)).astype(np.int32) * self._columns
-        cell += ((y + np.float32(y1)) * np.float32(1 / CELL_M)).astype(np.int32)
-        size = self._rows * self._columns
-        count = np.bincount(cell, minlength=size)[:size]
+        band = np.abs(x)
+        band *= BAND_SLOPE
+        band += BAND_M
+        near = np.abs(z) < band
+        near &= x > x0
+        near &= x < x1
+        near &= np.abs(y) < y1
+        x, y, z = points.take(np.flatnonzero(near), axis=1)
+        cell = ((x - x0) / CELL_M).astype(np.intp)
+        cell *= self._columns
+        cell += ((y + y1) / CELL_M).astype(np.intp)
+        count = np.bincount(cell, minlength=self._rows * self._columns)
         full = np.flatnonzero(count >= MIN_CELL_POINTS_N)
-        n = count[full].astype(np.float64)
-        sums = [np.bincount(cell, weights=w, minlength=size)[full] / n for w in (x, y, z)]
-        spread = np.sqrt(np.maximum(np.bincount(cell, weights=z * z, minlength=size)[full] / n - sums[2] ** 2, 0.0))
-        return sums[0], sums[1], sums[2], spread
+        n = count.take(full).astype(np.float64)
+        mean_x, mean_y, mean_z, mean_square = (
+            np.bincount(cell, weights=weights, minlength=count.size).take(full) / n for weights in (x, y, z, z * z)
+        )
+        return mean_x, mean_y, mean_z, np.sqrt(np.maximum(mean_square - mean_z * mean_z, 0.0))
 
-    def _vote(self, a: F64, z: F64) -> F64:
+    def _vote(self, places: F64, z: F64) -> F64:
+        """The plane through three cells that most cells lie on and fewest lie below; ``places``: their x and y."""
         count = z.size
         picks = np.minimum((self._draws * count).astype(np.intp), count - 1)
-        x, y, height = a[:, 1][picks], a[:, 2][picks], z[picks]
-        dx, dy, dz = x[:, 1:] - x[:, :1], y[:, 1:] - y[:, :1], height[:, 1:] - height[:, :1]
-        area = dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0]
+        corners = np.stack((*places, z)).take(picks, axis=1)  # x, y, z; draw; corner
+        first = corners[..., 0]
+        (dx, dy, dz), (ex, ey, ez) = corners[..., 1] - first, corners[..., 2] - first
+        area = dx * ey - ex * dy
         good = np.abs(area) > WIDE_M2
-        area = np.where(good, area, 1.0)
-        slope_x = (dz[:, 0] * dy[:, 1] - dz[:, 1] * dy[:, 0]) / area
-        slope_y = (dx[:, 0] * dz[:, 1] - dx[:, 1] * dz[:, 0]) / area
-        offset = height[:, 0] - slope_x * x[:, 0] - slope_y * y[:, 0]
-        good &= np.hypot(slope_x, slope_y) < LIMIT_RATIO * self._slope_limit
+        area[~good] = 1.0
+        slope_x, slope_y = (dz * ey - ez * dy) / area, (dx * ez - ex * dz) / area
+        offset = first[2] - slope_x * first[0] - slope_y * first[1]
+        tilt = slope_x * slope_x + slope_y * slope_y
+        good &= tilt < (LIMIT_RATIO * self._slope_limit) ** 2
         good &= np.abs(offset) < LIMIT_RATIO * self._offset_limit_m
-        planes = np.vstack((np.zeros((1, 3)), np.column_stack((offset, slope_x, slope_y))[good]))
-        residual = (z[None, :] - planes @ a.T).astype(np.float32)
-        inlier = np.maximum(np.float32(0.0), 1 - (residual * np.float32(1 / INLIER_M)) ** 2).sum(axis=1)
-        below = (residual < -2.0 * INLIER_M).sum(axis=1)
-        prior = (planes[:, 0] / self._offset_limit_m) ** 2 + (
-            np.hypot(planes[:, 1], planes[:, 2]) / self._slope_limit
-        ) ** 2
-        score = inlier - BELOW_VOTES * below - CALIBRATED_VOTES * count * prior
-        return np.asarray(planes[int(np.argmax(score))], dtype=np.float64)
-
-
-def _about(ground: Ground, x: F64, y: F64, z: F64) -> F64:
-    return np.asarray(z - ground.offset_m - ground.slope_x * x - ground.slope_y * y, dtype=np.float64)
+        good[0], offset[0], slope_x[0], slope_y[0] = True, 0.0, 0.0, 0.0  # the calibrated plane
+        planes = np.array((offset, slope_x, slope_y)).compress(good, axis=1)
+        residual = z.astype(np.float32) - planes.T.astype(np.float32) @ np.array(
+            (np.ones(count), *places), dtype=np.float32
+        )
+        below = residual < -2.0 * INLIER_M
+        residual /= INLIER_M
+        residual *= residual
+        votes = np.maximum(1.0 - residual, 0.0)
+        votes -= np.float32(BELOW_VOTES) * below
+        prior = (planes[0] / self._offset_limit_m) ** 2 + (planes[1] ** 2 + planes[2] ** 2) / self._slope_limit**2
+        return planes[:, int(np.argmax(votes.sum(axis=1) - CALIBRATED_VOTES * count * prior))]
 
 
 def _solve(normal: F64, right: F64) -> F64:

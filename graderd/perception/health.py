@@ -7,6 +7,7 @@ comes out of the registration (:mod:`graderd.perception.registration`) and is ju
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import cv2
@@ -22,7 +23,10 @@ from graderd.perception.registration import Stance
 from graderd.perception.settings import HealthSettings
 
 SAMPLE_STEP_PX = (16, 12)
-"""Rows and columns: a row costs a walk through memory, a pixel of it hardly anything."""
+"""Rows and columns of the sample in which light is judged: a row costs a walk through memory, a pixel of it hardly
+anything."""
+SAME_STEP_PX = (48, 12)
+"""The same for whether a picture is the one before: the sensors' noise is in every pixel."""
 TILE_PX, FLAT_GRAY = 4, 1.6
 """Side of a tile of the smoothed sample, and the standard deviation in it (grey levels) below which it shows nothing:
 the sensor's noise alone gives 0.5 to 1."""
@@ -95,13 +99,13 @@ class HealthMonitor:
         of a live stream are looked at now and then.
         """
         faults = self._size(frame)
-        sample = np.ascontiguousarray(frame.color_bgr[:: SAMPLE_STEP_PX[0], :: SAMPLE_STEP_PX[1]])
+        image = frame.color_bgr
         self.lit, self._is_watched = True, self._live and not needs_color
-        light = self._light_watch.check(lambda: self._light(sample)) if self._is_watched else self._light(sample)
+        light = self._light_watch.check(lambda: self._light(image)) if self._is_watched else self._light(image)
         if not needs_color and light and light[0].condition in ("black", "blown_out"):
             self.lit, light = False, []
         faults += light
-        faults += self._frozen(frame, sample)
+        faults += self._frozen(frame)
         faults += self._torn(frame)
         if needs_depth:
             faults += self._depth(frame)
@@ -132,8 +136,9 @@ class HealthMonitor:
             faults.append(PictureFault("wrong_resolution", detail))
         return faults
 
-    def _light(self, sample: U8) -> list[PictureFault]:
+    def _light(self, image_bgr: U8) -> list[PictureFault]:
         settings = self._settings
+        sample = np.ascontiguousarray(image_bgr[:: SAMPLE_STEP_PX[0], :: SAMPLE_STEP_PX[1]])
         gray = cv2.cvtColor(sample, cv2.COLOR_BGR2GRAY)
         mean_percent = float(gray.mean()) / GRAY_PERCENT
         if mean_percent < settings.black_percent:
@@ -150,14 +155,14 @@ class HealthMonitor:
             return [PictureFault("blocked", f"{flat:.0f} % of the picture shows no texture: something covers the lens")]
         return []
 
-    def _frozen(self, frame: Frame, sample: U8) -> list[PictureFault]:
+    def _frozen(self, frame: Frame) -> list[PictureFault]:
         if self._settings.frozen_frames_n == 0 or not self._live:
             return []
-        mark = sample.tobytes()
+        sample = frame.color_bgr[:: SAME_STEP_PX[0], :: SAME_STEP_PX[1], 1].tobytes()
         if frame.depth_mm is not None:
-            mark += frame.depth_mm[:: SAMPLE_STEP_PX[0], :: SAMPLE_STEP_PX[1]].tobytes()
-        self._same_n = self._same_n + 1 if mark == self._last_sample else 0
-        self._last_sample = mark
+            sample += frame.depth_mm[:: SAME_STEP_PX[0], :: SAME_STEP_PX[1]].tobytes()
+        self._same_n = self._same_n + 1 if sample == self._last_sample else 0
+        self._last_sample = sample
         if self._same_n >= self._settings.frozen_frames_n:
             return [PictureFault("frozen", f"the same picture {self._same_n + 1} times in a row")]
         return []
@@ -179,7 +184,7 @@ class HealthMonitor:
     def _depth(self, frame: Frame) -> list[PictureFault]:
         if frame.depth_mm is None:
             return [PictureFault("depth_missing", "the frame has no depth picture")]
-        sample = frame.depth_mm[::DEPTH_STEP_PX, ::DEPTH_STEP_PX]
+        sample = np.ascontiguousarray(frame.depth_mm[::DEPTH_STEP_PX, ::DEPTH_STEP_PX])
         valid = 100.0 * float(np.count_nonzero(sample)) / sample.size
         if valid < self._settings.depth_valid_percent:
             return [PictureFault("depth_missing", f"only {valid:.0f} % of the picture has depth")]
@@ -209,7 +214,7 @@ class HealthMonitor:
         its lifts say over ground in its place, is a blade that moved.
         """
         settings, fix, ground = self._settings, soil.blade, soil.ground
-        axis_m = float(np.hypot(fix.ahead_m, fix.along_m))
+        axis_m = math.hypot(fix.ahead_m, fix.along_m)
         moved: list[str] = []
         elsewhere: list[str] = []
         if max(abs(fix.ahead_m), abs(fix.along_m)) > settings.knocked_mm / 1000:
@@ -219,7 +224,7 @@ class HealthMonitor:
             (moved if axis_m > settings.knocked_axis_mm / 1000 else elsewhere).append(turned)
         if fix.missing * 100 > settings.knocked_missing_percent:
             moved.append(f"{fix.missing * 100:.0f} % of the blade is not where it should be")
-        offset_m = float(ground.height_at(np.zeros(1), np.zeros(1))[0])
+        offset_m = ground.offset_m
         level = abs(offset_m) < settings.knocked_ground_mm / 1000 and ground.slope_deg() < settings.knocked_ground_deg
         if soil.edge is None:
             # A level layer of soil looks like ground that is higher; see LAYER_MOST_M for how thick one may be.
@@ -228,7 +233,7 @@ class HealthMonitor:
                 moved.append(f"ground {offset_m * 1000:+.0f} mm off")
         else:
             up_m = soil.edge.height_m - stance.edge_m(self._blade) - stance.tall_m(self._blade)
-            tilted_deg = float(np.degrees(soil.edge.rise - stance.rise))
+            tilted_deg = math.degrees(soil.edge.rise - stance.rise)
             said = f"edge {up_m * 1000:+.0f} mm up, tilted by {tilted_deg:+.1f} deg"
             off = abs(up_m) > settings.knocked_ground_mm / 1000 or abs(tilted_deg) > settings.knocked_deg / 2
             if not level and off and abs(offset_m - up_m) < settings.knocked_axis_mm / 1000:

@@ -17,7 +17,16 @@ import numpy.typing as npt
 from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.hal.camera import DepthImage
-from graderd.perception.geometry import F32, F64, NOMINAL_WIDTH_PX, View, blade_points_m, face_setback_m, middle
+from graderd.perception.geometry import (
+    F32,
+    F64,
+    NOMINAL_WIDTH_PX,
+    View,
+    blade_points_m,
+    cos_sin,
+    face_setback_m,
+    middle,
+)
 from graderd.perception.ground import Ground
 
 SEARCH_M = 0.09
@@ -151,13 +160,15 @@ class BladeFix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _EdgeColumns:
-    """Pieces of picture columns across the blade's upper edge: flat pixel indices and their rays, columns x pixels.
+    """Pieces of picture columns across the blade's upper edge: flat pixel indices, columns x pixels, and their rays,
+    3 x columns x pixels. ``starts``: the place of each column's first pixel in the flat ones.
 
     ``body``: two pixels on the face below the edge in each column, likewise.
     """
 
     pixels: npt.NDArray[np.intp]
     rays: F32
+    starts: npt.NDArray[np.intp]
     body: npt.NDArray[np.intp]
     body_rays: F32
 
@@ -177,15 +188,17 @@ class BladeFinder:
 
     def setback(self, above_edge: npt.NDArray[np.floating]) -> F32:
         """Set-back of the hollow face, standing upright, at heights above its cutting edge (table look-up, 1 mm)."""
-        return np.asarray(self._setback[self._index(above_edge)], dtype=np.float32)
+        return self._setback.take(self._index(above_edge), mode="clip")
 
     def hollow_m2(self, above_edge: F64) -> F64:
         """Area between the hollow face and its edges' plane, from the cutting edge up to these heights."""
-        return np.asarray(self._hollow_m2[self._index(above_edge)], dtype=np.float64)
+        return self._hollow_m2.take(self._index(above_edge), mode="clip")
 
-    def _index(self, above_edge: npt.NDArray[np.floating]) -> npt.NDArray[np.int32]:
-        place = (above_edge - np.float32(TABLE_FROM_M)) * np.float32(1 / TABLE_STEP_M)
-        return np.asarray(np.clip(place, 0, self._setback.size - 1), dtype=np.int32)
+    def _index(self, above_edge: npt.NDArray[np.floating]) -> npt.NDArray[np.intp]:
+        """Places in the tables; those beyond an end are to be clipped."""
+        place = above_edge - TABLE_FROM_M
+        place /= TABLE_STEP_M
+        return place.astype(np.intp)
 
     def upper_edge(self, depth_mm: DepthImage, stance: Stance, ground: Ground) -> UpperEdge | None:
         """Where the upper edge is; None where it cannot be told.
@@ -195,30 +208,35 @@ class BladeFinder:
         columns = self._edge_columns(stance)
         if columns is None:
             return None
-        blade = self._blade
-        z_optical = depth_mm.ravel()[columns.pixels] * np.float32(0.001)
-        at = columns.rays * z_optical[..., None] + self._position
-        top_m = stance.edge_m(blade) + stance.tall_m(blade)
-        below = np.float32(top_m) - at[..., 2]
-        cos, sin = _cos_sin(stance.angle_deg)
-        d = at[..., 0] * cos + at[..., 1] * sin - np.float32(blade.x_offset_m)
-        tall = np.float32(stance.tall_m(blade))
-        off = d + self.setback(tall - below) - np.float32(stance.lean) * np.clip(tall - below, 0, tall)
-        face = (z_optical > 0) & (np.abs(off) < SEARCH_M)
-        column, first = np.arange(len(z_optical)), face.argmax(axis=1)
-        free = face.any(axis=1) & (first > 0)
-        edge_m = z_optical[column, first]
-        over = z_optical[column[:, None], np.maximum(first[:, None] - ABOVE_PX, 0)] - edge_m[:, None]
-        nothing = over == -edge_m[:, None]
-        free &= (nothing | (over > -STEP_M)).all(axis=1)
-        free &= (over > STEP_M).sum(axis=1) >= 2  # what has no depth may be nearer as well
-        if free.sum() < TOP_COLUMNS_N // 3:
+        blade, tall_m = self._blade, stance.tall_m(self._blade)
+        z_optical = depth_mm.ravel().take(columns.pixels) * np.float32(0.001)
+        at = columns.rays * z_optical
+        at += self._position[:, None, None]
+        above_edge = at[2] - stance.edge_m(blade)
+        cos, sin = cos_sin(stance.angle_deg)
+        off = self.setback(above_edge)
+        off += cos * at[0]
+        off += sin * at[1]
+        off -= blade.x_offset_m
+        if stance.lean:
+            off -= stance.lean * above_edge.clip(0, tall_m)
+        face = np.abs(off) < SEARCH_M
+        face &= z_optical > 0
+        first = face.argmax(axis=1)
+        place = first + columns.starts
+        edge_m = z_optical.take(place)[:, None]
+        over_m = z_optical.take(np.maximum(first[:, None] - ABOVE_PX, 0) + columns.starts[:, None])
+        free = (over_m > edge_m + STEP_M).sum(axis=1) >= 2  # what has no depth may be nearer as well
+        free &= ((over_m > edge_m - STEP_M) | (over_m == 0)).all(axis=1)
+        free &= (first > 0) & face.ravel().take(place)
+        place = place[free]
+        if place.size < TOP_COLUMNS_N // 3:
             return None
-        x, y, z = (at[column[free], first[free], axis].astype(np.float64) for axis in range(3))
+        x, y, z = at.reshape(3, -1).take(place, axis=1).astype(np.float64)
         s = y * cos - x * sin
         over_ground = z - ground.height_at(x, y)
-        rise = _median_slope(s, z) if s.max() - s.min() > TOP_SHARE * blade.length_m else stance.rise
-        tilted = rise - float(ground.slope_y * cos - ground.slope_x * sin)
+        rise = _median_slope(s, z) if np.ptp(s) > TOP_SHARE * blade.length_m else stance.rise
+        tilted = rise - (ground.slope_y * cos - ground.slope_x * sin)
         return UpperEdge(middle(z - rise * s), rise, middle(over_ground - tilted * s))
 
     def displaced(self, depth_mm: DepthImage, stance: Stance) -> BladeFix:
@@ -232,10 +250,10 @@ class BladeFinder:
             return BladeFix()
         z_optical = depth_mm.ravel()[columns.body] * np.float32(0.001)
         at = columns.body_rays * z_optical[..., None] + self._position
-        cos, sin = _cos_sin(stance.angle_deg)
-        d = at[..., 0] * cos + at[..., 1] * sin - np.float32(self._blade.x_offset_m)
-        above_edge = at[..., 2] - np.float32(stance.edge_m(self._blade))
-        face = d + self.setback(above_edge) - np.float32(stance.lean) * above_edge
+        cos, sin = cos_sin(stance.angle_deg)
+        d = at[..., 0] * cos + at[..., 1] * sin - self._blade.x_offset_m
+        above_edge = at[..., 2] - stance.edge_m(self._blade)
+        face = d + self.setback(above_edge) - stance.lean * above_edge
         valid = (z_optical > 0).all(axis=1)
         if valid.sum() < TOP_COLUMNS_N // 3:
             return BladeFix()
@@ -261,7 +279,8 @@ class BladeFinder:
             down = np.arange(-reach, reach + 1, stride)
             v = v[inside, None] + down[None, :]
             u = np.broadcast_to(u[inside, None], v.shape)
-            columns = _EdgeColumns(v * lens.width + u, self._all_rays[v, u], *self._body(stance))
+            rays = np.ascontiguousarray(self._all_rays[v, u].transpose(2, 0, 1))
+            columns = _EdgeColumns(v * lens.width + u, rays, np.arange(len(v)) * down.size, *self._body(stance))
         if len(self._columns) >= KEPT_COLUMNS_N:
             self._columns.clear()
         self._columns[stance] = columns
@@ -289,51 +308,54 @@ class BladeFinder:
         ``above_edge`` how far above the cutting edge, of a blade ``tall_m`` from edge to edge."""
         blade = self._blade
         half = blade.length_m / 2
-        upper = (
-            (above_edge > tall_m - FACE_BAND_M)
-            & (above_edge < tall_m - FACE_BELOW_TOP_M)
-            & (np.abs(s) < half + SEARCH_M)
-        )
-        near = np.flatnonzero(upper & (np.abs(face) < SEARCH_M))
+        upper = above_edge > tall_m - FACE_BAND_M
+        upper &= above_edge < tall_m - FACE_BELOW_TOP_M
+        upper &= np.abs(face) < SEARCH_M
+        upper &= np.abs(s) < half + SEARCH_M
+        near = np.flatnonzero(upper)
         if near.size < FACE_LEAST_N:
             return BladeFix()
         near = near[:: max(1, near.size // FACE_POINTS_N)]
-        near_s, near_face = s[near], face[near]
-        column = ((near_s + np.float32(half)) * np.float32(COLUMNS_N / blade.length_m)).astype(np.int32)
-        inside = (column >= 0) & (column < COLUMNS_N)
-        face_at, upright = self._upright(
-            column[inside], near_face[inside], np.float32(tall_m) - above_edge[near][inside]
-        )
-        s_at = (np.flatnonzero(upright) + 0.5) / COLUMNS_N * blade.length_m - half
+        near_s, near_face = s.take(near), face.take(near)
+        inside = np.flatnonzero(np.abs(near_s) < half)
+        column = ((near_s.take(inside) + half) * (COLUMNS_N / blade.length_m)).astype(np.intp)
+        below_m = tall_m - above_edge.take(near.take(inside))
+        face_at, upright = self._upright(np.minimum(column, COLUMNS_N - 1, out=column), near_face.take(inside), below_m)
+        s_at = (np.flatnonzero(upright).astype(np.float64) + 0.5) * (blade.length_m / COLUMNS_N) - half
         if s_at.size < SEEN_LEAST_N:
             return BladeFix()
         ahead, slope = _line_of_most(s_at, face_at)
-        on_face = np.abs(near_face - np.float32(ahead) - np.float32(slope) * near_s) < ON_FACE_M
-        along = self._ends(near_s[on_face])
-        return BladeFix(ahead, along, -float(np.degrees(np.arctan(slope))), float(on_face.mean()), 0.0)
+        on_face = np.flatnonzero(np.abs(near_face - ahead - slope * near_s) < ON_FACE_M)
+        along = self._ends(near_s.take(on_face))
+        return BladeFix(ahead, along, -math.degrees(math.atan(slope)), on_face.size / near.size, 0.0)
 
-    def _upright(self, column: npt.NDArray[np.int32], face: F32, below_m: F32) -> tuple[F64, npt.NDArray[np.bool_]]:
+    def _upright(self, column: npt.NDArray[np.intp], face: F32, below_m: F32) -> tuple[F64, npt.NDArray[np.bool_]]:
         """Per column where the face stands, for the columns in which something upright is seen, and which those are.
 
         What stands upright shows at the same place at many heights. Soil that leans on the face, up to the edge where
         the blade casts it aside, shows at each height at another place; hoses and rods are narrow and lie ahead.
         """
         places_n = round(2 * SEARCH_M / PLACE_M)
-        place = ((face + np.float32(SEARCH_M)) * np.float32(1 / PLACE_M)).astype(np.int32)
-        place = np.minimum(place, places_n - 1)
+        place = ((face + SEARCH_M) / PLACE_M).astype(np.intp)
+        np.minimum(place, places_n - 1, out=place)
         levels_n = round(FACE_BAND_M / LEVEL_M)
-        level = np.minimum((np.maximum(below_m, 0) * np.float32(1 / LEVEL_M)).astype(np.int32), levels_n - 1)
-        shape = (COLUMNS_N, places_n, levels_n)
-        index = (column * places_n + place) * levels_n + level
-        shown = np.bincount(index, minlength=COLUMNS_N * places_n * levels_n).reshape(shape) > 0
-        two = shown[:, 1:] | shown[:, :-1]  # a face lies across the bound of two places as well as on one
-        tall = two.sum(axis=2)
+        level = (below_m / LEVEL_M).astype(np.intp)
+        index = column * places_n
+        index += place
+        index *= levels_n
+        index += np.minimum(level, levels_n - 1, out=level)
+        shown = np.zeros((COLUMNS_N, places_n, levels_n), dtype=np.float32)
+        shown.reshape(-1)[index] = 1
+        # A face lies across the bound of two places as well as on one.
+        tall = np.maximum(shown[:, 1:], shown[:, :-1]).sum(axis=2)
         best = tall.argmax(axis=1)  # the rearmost where several are as tall
-        upright = tall[np.arange(COLUMNS_N), best] >= UPRIGHT_LEVELS_N
-        on_it = (place == best[column]) | (place == best[column] + 1)
-        on_it &= upright[column]
-        count = np.bincount(column[on_it], minlength=COLUMNS_N)
-        total = np.bincount(column[on_it], weights=face[on_it], minlength=COLUMNS_N)
+        upright = tall.max(axis=1) >= UPRIGHT_LEVELS_N
+        best[~upright] = -2
+        off = place - best.take(column)
+        on_it = np.flatnonzero((off == 0) | (off == 1))
+        column = column.take(on_it)
+        count = np.bincount(column, minlength=COLUMNS_N)
+        total = np.bincount(column, weights=face.take(on_it), minlength=COLUMNS_N)
         return np.asarray(total[upright] / count[upright], dtype=np.float64), upright
 
     def _ends(self, s: F32) -> float:
@@ -346,10 +368,6 @@ class BladeFinder:
         if abs((high - low) - length) > ENDS_LENGTH_M:
             return 0.0  # an end is hidden; the middle of what is seen says nothing
         return float(low + high) / 2
-
-
-def _cos_sin(angle_deg: float) -> tuple[np.float32, np.float32]:
-    return np.float32(math.cos(math.radians(angle_deg))), np.float32(math.sin(math.radians(angle_deg)))
 
 
 @functools.cache
@@ -369,11 +387,12 @@ def _line_of_most(s: F64, face: F64) -> tuple[float, float]:
     at_0 = face[first] - slope * s[first]
     off = face - at_0[:, None] - slope[:, None] * s
     on_line = np.abs(off) < ON_FACE_M
-    score = on_line.sum(axis=1) - BEHIND_VOTES * (off <= -ON_FACE_M).sum(axis=1) - np.abs(slope) * TURN_VOTES
-    best = int(np.argmax(score - at_0))
+    votes = on_line - BEHIND_VOTES * (off <= -ON_FACE_M)
+    best = int(np.argmax(votes.sum(axis=1) - np.abs(slope) * TURN_VOTES - at_0))
     s, face = s[on_line[best]], face[on_line[best]]
-    s_mean, face_mean = s.mean(), face.mean()
-    fitted = float((s - s_mean) @ (face - face_mean) / ((s - s_mean) @ (s - s_mean)))
+    s_mean, face_mean = s.sum() / s.size, face.sum() / s.size
+    s -= s_mean
+    fitted = float(s @ face / (s @ s))
     return float(face_mean - fitted * s_mean), fitted
 
 

@@ -115,7 +115,7 @@ def test_the_surface_is_found_to_the_millimetre() -> None:
     true = Ground(0.01, 0.05, -0.02, 0.05, 0.0, 0.04)
     z = (true.height_at(x.astype(np.float64), y.astype(np.float64)) + rng.normal(0, 0.002, x.size)).astype(np.float32)
     view = View(CameraCalibration().depth.intrinsics(), CameraCalibration().depth.pose("facing_blade_from_front"))
-    found = GroundFit(BladeGeometry(), view.position_m, 0.055, 8.0).fit(x, y, z, 0.0)
+    found = GroundFit(BladeGeometry(), view.position_m, 0.055, 8.0).fit(np.stack((x, y, z)), 0.0)
     at = np.array([0.0, 0.2, 0.3]), np.array([0.0, -0.3, 0.4])
     assert found.height_at(*at) == pytest.approx(true.height_at(*at), abs=0.002)
     assert 0.001 < found.residual_m < 0.005

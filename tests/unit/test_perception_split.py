@@ -12,7 +12,7 @@ from graderd.core.blade import BladeGeometry, meeting_point
 from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.camera import Frame
 from graderd.perception.classifier import make_classifier
-from graderd.perception.depth import Cells, split_soil
+from graderd.perception.depth import Cells, SoilSplit
 from graderd.perception.geometry import CENTER, LEFT, RIGHT
 from graderd.perception.settings import CameraCalibration, Method, PerceptionSettings
 from graderd.simulator.camera.appearance import Appearance
@@ -30,7 +30,7 @@ REPOSE_DEG, TRAVEL_M = 33.0, 0.49
 
 
 def split(height_m: np.ndarray, angle_deg: float = 0.0) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    return split_soil(height_m, CELLS, angle_deg, BLADE, REPOSE_DEG, TRAVEL_M)
+    return SoilSplit(CELLS, BLADE, REPOSE_DEG, TRAVEL_M)(height_m, angle_deg)
 
 
 def leaning(s_from: float, s_to: float, height_m: float, slope_deg: float = 40.0) -> np.ndarray:
