@@ -84,12 +84,12 @@ def known_bed(seed: int, half_length_mm: float, lens: Intrinsics = DEPTH_INTRINS
     top_mm = foot_mm * rng.uniform(0.25, 0.6)
     profile = trapezoid(middle_mm, top_mm, foot_mm, height_mm)
     slope_mm = 120.0
-    y = np.linspace(-1500.0, 1500.0, 300_001)
+    y = np.linspace(-1500.0, 1500.0, 30_001)
     across = profile(y)
     held = np.cumsum(across) / across.sum()
     mean = float(across @ y / across.sum())
     # Along the travel a trapezoid too: the stretch that holds 95 % of it, and the profile as its mean.
-    x = np.linspace(-half_length_mm, half_length_mm, 100_001)
+    x = np.linspace(-half_length_mm, half_length_mm, 10_001)
     along = np.clip((half_length_mm - np.abs(x)) / slope_mm, 0.0, 1.0)
     inner = np.interp((0.025, 0.975), np.cumsum(along) / along.sum(), x)
     share = float(along.sum() * (x[1] - x[0]) / (inner[1] - inner[0]))

@@ -141,7 +141,7 @@ def bed_of(scans: Sequence[Points], cell_mm: float, grid: Grid | None = None, ba
         others = np.arange(len(scans)) != left_out
         each = _mean(sums[others], counts[others])
         each[~measured] = np.nan
-        repeats.append(fill(each - (level if bare else fit_level(each, ground, grid)), inside))
+        repeats.append(fill(each - (level if bare else LevelFit(ground & np.isfinite(each), grid).of(each)), inside))
     with np.errstate(invalid="ignore", divide="ignore"):
         each = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
     cell_noise = _scan_noise_mm(each, measured & (counts > 0).all(axis=0))
@@ -258,19 +258,27 @@ def _level(heights: F64, grid: Grid) -> tuple[Bool, F64]:
         ground = np.isfinite(heights) & ~dilate(soil, grid.cells(CLEAR_MM))
         if ground.sum() < grid.cells(GROUND_MM) ** 2:
             raise NoGroundError("hardly any ground is clear of soil")
-        level = fit_level(heights, ground, grid)
+        level = LevelFit(ground, grid).of(heights)
         off = box_mean(np.where(ground, heights - level, np.nan), half)[ground]
         threshold = SOIL_DEVIATIONS_N * float(np.sqrt(np.mean(off**2)))
     return ground, level
 
 
-def fit_level(heights: F64, ground: Bool, grid: Grid) -> F64:
-    """The plane through the ground's cells, as a map."""
-    x, y = np.meshgrid(grid.x_mm / 1000.0, grid.y_mm / 1000.0, indexing="ij")
-    use = ground & np.isfinite(heights)
-    a = np.column_stack((np.ones(int(use.sum())), x[use], y[use]))
-    c = np.linalg.solve(a.T @ a + 1e-9 * np.eye(3), a.T @ heights[use])
-    return np.asarray(c[0] + c[1] * x + c[2] * y, dtype=np.float64)
+class LevelFit:
+    """The plane through the cells of ``use``, as a map; for several maps that are known there."""
+
+    def __init__(self, use: Bool, grid: Grid) -> None:
+        self._x, self._y = grid.x_mm[:, None] / 1000.0, grid.y_mm[None, :] / 1000.0
+        self._cells = np.flatnonzero(use)
+        ones = np.ones(self._cells.size)
+        x, y = (np.broadcast_to(axis, use.shape).reshape(-1)[self._cells] for axis in (self._x, self._y))
+        a = np.stack((ones, x, y))
+        self._solved = np.linalg.solve(a @ a.T + 1e-9 * np.eye(3), a)
+
+    def of(self, heights: F64) -> F64:
+        """That of a map."""
+        c = self._solved @ heights.reshape(-1)[self._cells]
+        return np.asarray(c[0] + c[1] * self._x + c[2] * self._y, dtype=np.float64)
 
 
 def _scan_noise_mm(each: F64, everywhere: Bool) -> float:
@@ -333,8 +341,9 @@ def _pull_push(heights: F64) -> F64:
     known = np.isfinite(heights)
     if known.all() or min(heights.shape) < 2:
         return np.where(known, heights, np.nanmean(heights) if known.any() else 0.0)
-    pad = [(0, size % 2) for size in heights.shape]
-    value, weight = np.pad(np.where(known, heights, 0.0), pad), np.pad(known.astype(np.float64), pad)
+    value, weight = np.zeros((2, *(size + size % 2 for size in heights.shape)))
+    whole = tuple(map(slice, heights.shape))
+    value[whole], weight[whole] = np.where(known, heights, 0.0), known
     half = (value.shape[0] // 2, 2, value.shape[1] // 2, 2)
     total, count = value.reshape(half).sum(axis=(1, 3)), weight.reshape(half).sum(axis=(1, 3))
     coarse = _pull_push(np.where(count > 0, total / np.maximum(count, 1.0), np.nan))

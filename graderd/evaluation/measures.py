@@ -195,7 +195,7 @@ def _holding(profile: F64, places_mm: F64, share: float) -> float:
     step = places_mm[1] - places_mm[0]
     before = np.cumsum(profile) - profile
     # Within a cell by a cubic that keeps the cell's sum and takes the heights at its two edges from its neighbours.
-    edge = np.convolve(np.pad(profile, 1), (0.5, 0.5), mode="valid")
+    edge = np.convolve(profile, (0.5, 0.5))
     t = (np.arange(FINER_N) / FINER_N)[None, :]
     here, low_edge, high_edge = (each[:, None] for each in (profile, edge[:-1], edge[1:]))
     inner = here * t**2 * (3 - 2 * t) + low_edge * t * (1 - t) ** 2 - high_edge * t**2 * (1 - t)

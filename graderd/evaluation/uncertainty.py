@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graderd.evaluation.bed import Bed, fill, fit_level
+from graderd.evaluation.bed import Bed, LevelFit, fill
 from graderd.evaluation.ground import F64
 from graderd.evaluation.measures import NothingThereError
 
@@ -101,6 +101,7 @@ class _Noise:
         share = (held[n:, n:] - held[:-n, n:] - held[n:, :-n] + held[:-n, :-n]) / n**2
         self._corners = np.argwhere(share >= BLOCK_SHARE)
         self._residual = np.where(known, bed.residual_mm, 0.0)
+        self._level = LevelFit(bed.ground, bed.grid) if bed.ground.any() else None
         self.known = len(self._corners) > n**2
 
     def disturbed(self) -> F64:
@@ -115,8 +116,8 @@ class _Noise:
         noise = (
             blocks.reshape(rows, columns, n, n).swapaxes(1, 2).reshape(rows * n, columns * n)[: shape[0], : shape[1]]
         )
-        if bed.ground.any():
-            noise = noise - fit_level(noise, bed.ground, bed.grid)
+        if self._level is not None:
+            noise = noise - self._level.of(noise)
         shift = (int(self._rng.integers(shape[0])), int(self._rng.integers(shape[1])))
         unseen = np.roll(bed.inside & ~bed.measured, shift, axis=(0, 1))
         return fill(np.where(unseen, np.nan, bed.heights_mm + noise), bed.inside)

@@ -62,7 +62,9 @@ class TopCamera:
         dx, dy, dz = (self.rays[..., axis] for axis in range(3))
         depth = np.full(dx.shape, self.height_mm)
         for _ in range(14):  # converges where soil is less steep than the view
-            depth = (self.height_mm - surface(depth * dx, depth * dy)) / -dz
+            before, depth = depth, (self.height_mm - surface(depth * dx, depth * dy)) / -dz
+            if np.abs(depth - before).max() < 0.001:
+                break
         if self.wall_y_mm is not None:
             meets = self.wall_y_mm / np.maximum(np.abs(dy), 1e-6)
             up = self.height_mm + meets * dz
