@@ -129,6 +129,11 @@ WARN = 'logging.getLogger("graderd.x").warning("a\\nb", extra={"device": "can"})
 @pytest.mark.live
 def test_in_the_journal_without_its_socket_each_line_carries_its_priority(tmp_path: Path) -> None:
     assert logged(WARN, in_journal=True, address=tmp_path / "none") == "<4>a\\nb\n"
+    raised = 'try: 1 / 0\nexcept ZeroDivisionError: logging.getLogger("graderd.x").exception("lost")'
+    lines = logged(raised, in_journal=True, address=tmp_path / "none").splitlines()
+    assert lines[0] == "<3>lost"
+    assert lines[-1] == "<3>ZeroDivisionError: division by zero"
+    assert all(line.startswith("<3>") for line in lines)
 
 
 @pytest.mark.live
