@@ -87,6 +87,15 @@ class RecordingSettings(Settings):
     min_free_mb: NotNegative = Field(200.0, description="recording pauses below this; control goes on")
 
 
+class FoxgloveSettings(Settings):
+    """A live view for Foxglove on a WebSocket of this machine alone: picture, thirds, blade, plots. Off without a port;
+    wants the extra ``foxglove``."""
+
+    port_n: int | None = Field(None, ge=1, le=65535, description="TCP port on 127.0.0.1, usually 8765; none: off")
+    rate_hz: Positive = Field(20.0, le=20, description="statuses per second")
+    pictures_hz: NotNegative = Field(5.0, le=15, description="pictures per second, while somebody looks at them")
+
+
 class StateSettings(Settings):
     """What survives a restart: the reason of the last stop."""
 
@@ -188,6 +197,7 @@ class Config(Settings):
     control: ControlSettings = Field(default_factory=ControlSettings)
     api: ApiSettings = Field(default_factory=ApiSettings)
     recording: RecordingSettings = Field(default_factory=RecordingSettings)
+    foxglove: FoxgloveSettings = Field(default_factory=FoxgloveSettings)
     state: StateSettings = Field(default_factory=StateSettings)
     stop_input: AnyStopInputSettings = Field(default_factory=StopInputSettings)
     vehicle: VehicleSettings = Field(default_factory=VehicleSettings)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import pickle
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -485,6 +486,13 @@ def log_message(log_ns: int, level: int, name: str, text: str) -> Message:
     """A log line by Foxglove's schema."""
     told = json.dumps({"level": level, "message": text, "name": name, "file": "", "line": 0})
     return Message(LOG, log_ns, f'{{"timestamp":{_stamp(log_ns)},{told[1:]}'.encode())
+
+
+def blade_message(log_ns: int, angle_deg: float, height_mm: float | None) -> Message:
+    """The blade in the vehicle's frame: turned about its axis, at its height."""
+    half = math.radians(angle_deg) / 2.0
+    at_m, quaternion = (0.0, 0.0, (height_mm or 0.0) / 1000.0), (0.0, 0.0, math.sin(half), math.cos(half))
+    return transform_message(log_ns, "vehicle", "blade", at_m, quaternion)
 
 
 def transform_message(

@@ -51,13 +51,13 @@ from graderd.record.layout import (
     Memory,
     Message,
     Wire,
+    blade_message,
     image_message,
     log_message,
     memory_of,
     schema_of,
     sensed_bytes,
     tick_bytes,
-    transform_message,
 )
 from graderd.record.store import Store, directory_of
 
@@ -571,7 +571,8 @@ class Translator:
             yield log_message(at_ns, LEVELS[level], name, text)
         if tick.now_s >= self._transform_due_s:
             self._transform_due_s = tick.now_s + TRANSFORM_EVERY_S
-            yield from _transforms(tick, at_ns)
+            if tick.pose.rotation_deg is not None:
+                yield blade_message(at_ns, tick.pose.rotation_deg, tick.attitude.height_mm)
 
     def _changes(self, step: Step) -> Iterator[tuple[str, str, str]]:
         """Level, name and words of what happened in this tick."""
@@ -593,17 +594,6 @@ class Translator:
             for name in sorted(self._faults - names):
                 yield "INFO", "fault", f"{name}: over"
             self._faults = names
-
-
-def _transforms(tick: Tick, at_ns: int) -> Iterator[Message]:
-    """The blade in the vehicle's frame: turned about its axis, at its height."""
-    angle_deg = tick.pose.rotation_deg
-    if angle_deg is None:
-        return
-    half = math.radians(angle_deg) / 2.0
-    height_m = (tick.attitude.height_mm or 0.0) / 1000.0
-    quaternion = (0.0, 0.0, math.sin(half), math.cos(half))
-    yield transform_message(at_ns, "vehicle", "blade", (0.0, 0.0, height_m), quaternion)
 
 
 class IncidentWatch:

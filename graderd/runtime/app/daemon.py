@@ -26,6 +26,7 @@ from graderd.record.recorder import Recorder
 from graderd.runtime.app.devices import build_devices, build_stop_input, problems
 from graderd.runtime.app.journal import set_up_logging
 from graderd.runtime.app.last_run import remember
+from graderd.runtime.app.live_view import LiveView
 from graderd.runtime.app.services import build_services
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
 from graderd.runtime.control import ControlLoop
@@ -221,6 +222,9 @@ class Daemon:
     def _helpers(self) -> dict[str, Callable[[], Coroutine[Any, Any, None]]]:
         """What may fail without a word to the blade, and is started again; what it fails to do is told as a fault."""
         helpers = {"perception": self._eyes.run, "health": self._health.run, "recorder": self._recorder.run}
+        if self._config.foxglove.port_n is not None:
+            view = LiveView(self._config.foxglove, Path(self._config.api.socket))
+            helpers["live-view"] = view.run
         if self._stop_input is not None:
             helpers["stop-input"] = self._stop_input.run
         if self._rig is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import grp
 import os
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 from graderd.api.server import MAX_PATH_BYTES, tls_context
@@ -122,6 +123,8 @@ def problems(config: Config) -> list[str]:
             read_tokens(api.tcp.token_file)
         except DeviceError as error:
             found.append(" ".join(str(error).split()))
+    if config.foxglove.port_n is not None and find_spec("foxglove") is None:
+        found.append("foxglove.port_n: the live view's library is not installed. pip install 'graderd[foxglove]'")
     if api.socket_group:
         try:
             grp.getgrnam(api.socket_group)
