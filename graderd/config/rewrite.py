@@ -110,17 +110,60 @@ def check_rights(path: Path) -> None:
 
 
 def merged(text: str, changes: Mapping[str, Any]) -> str:
-    """The configuration ``text`` with ``changes`` (tables of tables) put in; comments and order stay.
+    """The configuration ``text`` with ``changes`` (tables of tables) put in; comments and order stay. A key that stands
+    there as a comment with its default (``graderd config init``) takes that line, beneath its explanation.
 
     Raises:
         ConfigError: the text is not TOML, or has a value where ``changes`` has a table.
     """
     try:
-        document = tomlkit.parse(text)
+        document = tomlkit.parse(_with_room(text, changes))
         _merge(document, changes)
         return tomlkit.dumps(document)
     except (TOMLKitError, TypeError) as error:
         raise ConfigError(None, [f"not a configuration: {error}. Correct it first"]) from None
+
+
+_HEADER = re.compile(r"\s*\[([\w.]+)\]\s*(#.*)?")
+
+
+def _with_room(text: str, changes: Mapping[str, Any]) -> str:
+    """``text`` with a line for each key of ``changes`` that its table lacks: the one where it stands as a comment, else
+    the one below the table's header. (tomlkit would put it at the table's end, beneath what explains the next one.)"""
+    present = tomlkit.parse(text).unwrap()
+    lines = text.split("\n")
+    for table, key, value in _plain_keys(changes):
+        if _has(present, (*table, key)):
+            continue
+        headers = [(number, match[1]) for number, line in enumerate(lines) if (match := _HEADER.fullmatch(line))]
+        starts = [number for number, name in headers if name == ".".join(table)] if table else [-1]
+        if not starts:
+            continue
+        end = next((number for number, _ in headers if number > starts[0]), len(lines))
+        commented = re.compile(rf"#\s?{re.escape(key)}(: not set| = .*)")
+        places = [number for number in range(starts[0] + 1, end) if commented.fullmatch(lines[number])]
+        written = f"{key} = {tomlkit.item(_value(value)).as_string()}"
+        if places:
+            lines[places[0]] = written
+        elif table:
+            lines.insert(starts[0] + 1, written)
+    return "\n".join(lines)
+
+
+def _plain_keys(changes: Mapping[str, Any], table: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str, Any]]:
+    for key, value in changes.items():
+        if isinstance(value, Mapping):
+            yield from _plain_keys(value, (*table, key))
+        else:
+            yield table, key, value
+
+
+def _has(values: Any, path: tuple[str, ...]) -> bool:
+    for key in path:
+        if not isinstance(values, Mapping) or key not in values:
+            return False
+        values = values[key]
+    return True
 
 
 def _merge(table: Any, changes: Mapping[str, Any]) -> None:
@@ -130,9 +173,12 @@ def _merge(table: Any, changes: Mapping[str, Any]) -> None:
                 table[key] = tomlkit.table()
             _merge(table[key], value)
         else:
-            table[key] = (
-                round(value, 6) if isinstance(value, float) else list(value) if isinstance(value, tuple) else value
-            )
+            table[key] = _value(value)
+
+
+def _value(value: Any) -> Any:
+    """As it is written."""
+    return round(value, 6) if isinstance(value, float) else list(value) if isinstance(value, tuple) else value
 
 
 @dataclass

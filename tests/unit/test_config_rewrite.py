@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
 import os
 import re
@@ -19,6 +20,7 @@ from graderd.config import ConfigError, load
 from graderd.config import rewrite as module
 from graderd.config.migrate import CURRENT_VERSION
 from graderd.config.rewrite import BACKUPS_N, check_rights, merged, rewrite
+from graderd.config.template import template
 
 OLD = f"# mine\nversion = {CURRENT_VERSION}\n[blade]\nlength_m = 1.0 # measured\n"
 
@@ -320,3 +322,21 @@ def test_what_is_no_file(tmp_path: Path, kind: str) -> None:
         path.mkdir()
     with pytest.raises(ConfigError, match=r"no regular file|Is a directory"):
         rewrite(path, longer)
+
+
+def test_a_key_takes_the_line_where_it_stood_as_a_comment() -> None:
+    """Beneath its own explanation, not beneath what explains the next table; what has no such line comes below the
+    table's header, and nothing else changes."""
+    before = template()
+    changes = {"simulated": True, "rotation": {"port": "/dev/servo"}, "camera": {"exposure_us": 80.0}}
+    after = merged(before, changes).splitlines()
+    removed, added = (
+        [line[2:] for line in difflib.ndiff(before.splitlines(), after) if line.startswith(mark)]
+        for mark in ("- ", "+ ")
+    )
+    assert removed == ["#simulated = false", "# exposure_us: not set", '#port = "/dev/graderd/servo"']
+    assert added == ["simulated = true", "exposure_us = 80.0", 'port = "/dev/servo"']
+    assert after[after.index('port = "/dev/servo"') - 1] == "# serial port, or a udev symlink to it"
+    assert merged("[tilt]\nmin_mm = 4.0\n\n# of the rule\n[rule]\n", {"tilt": {"max_mm": 90.0}}) == (
+        "[tilt]\nmax_mm = 90.0\nmin_mm = 4.0\n\n# of the rule\n[rule]\n"
+    )
