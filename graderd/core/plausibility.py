@@ -131,9 +131,16 @@ class AxisSample(NamedTuple):
 
 
 def axis_sample(name: str, lifecycle: Lifecycle, told: RotatorTelemetry | ActuatorTelemetry) -> AxisSample | None:
-    """The sample that a device's telemetry gives; None without a valid position."""
+    """The sample that a device's telemetry gives; None without a valid position.
+
+    None, too, of a disarmed blade whose servo says that its torque is off: a person may turn that by hand, and is asked
+    to (``graderd calibrate rotation``). Where the torque is on, or not known, whatever turns is uncommanded.
+    """
     position, velocity, current = told.position, told.velocity, told.current_a
     if position is None or not position.valid:
+        return None
+    torque_on = told.torque_on if isinstance(told, RotatorTelemetry) else None
+    if lifecycle is not Lifecycle.ACTIVE and torque_on is not None and torque_on.valid and not torque_on.value:
         return None
     return AxisSample(
         name=name,

@@ -13,8 +13,11 @@ from hypothesis import strategies as st
 from graderd.config import Config
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import catalogue_key
-from graderd.core.plausibility import AxisSample, PlausibilityMonitor, motion_figures
+from graderd.core.plausibility import AxisSample, PlausibilityMonitor, axis_sample, motion_figures
 from graderd.drivers.dynamixel.arming import HOLD_ACCELERATION_FACTOR
+from graderd.hal.device import Lifecycle
+from graderd.hal.reading import Reading
+from graderd.hal.rotator import RotatorTelemetry
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo.motion import Profile, Trajectory
 
@@ -338,6 +341,32 @@ def test_nothing_is_concluded_across_a_gap_or_an_invalid_reading() -> None:
             if away and gap:
                 continue
             assert monitor.judge(samples, now_s) == ()
+
+
+@pytest.mark.parametrize(
+    ("torque_on", "lifecycle", "stops"),
+    [
+        (False, Lifecycle.STANDBY, False),
+        (True, Lifecycle.STANDBY, True),
+        (None, Lifecycle.STANDBY, True),
+        (False, Lifecycle.ACTIVE, True),
+    ],
+)
+def test_a_disarmed_blade_without_torque_may_be_turned_by_hand(
+    torque_on: bool | None, lifecycle: Lifecycle, stops: bool
+) -> None:
+    """As bring-up and the calibration ask for; with torque, or where nobody knows, a turn is uncommanded."""
+    monitor, seen = PlausibilityMonitor(FIGURES), set()
+    for tick in range(150):
+        now_s = tick * TICK_S
+        told = RotatorTelemetry(
+            angle_deg=Reading(max(0.0, now_s - 1.0) * 15.0, now_s, True),
+            velocity_deg_per_s=Reading(15.0 if now_s > 1.0 else 0.0, now_s, True),
+            torque_on=None if torque_on is None else Reading(torque_on, now_s, True),
+        )
+        sample = axis_sample("rotation", lifecycle, told)
+        seen |= {fault.condition for fault in monitor.judge(() if sample is None else (sample,), now_s)}
+    assert ("moving_uncommanded" in seen) is stops
 
 
 def test_arming_and_disarming_begin_anew() -> None:
