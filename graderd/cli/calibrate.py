@@ -13,7 +13,8 @@ import typer
 
 from graderd import places
 from graderd.cli import calibrate_color, calibrate_lifts, calibrate_rotation
-from graderd.cli.console import CliError, ExitCode, Json, agree, client_of, example, plain_table, print_json, print_text
+from graderd.cli.asking import agree
+from graderd.cli.console import CliError, ExitCode, Json, client_of, example, plain_table, print_json, print_text
 from graderd.hal.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -100,7 +101,9 @@ def register(app: typer.Typer) -> None:
             print_json(_result_object(settings, result, save))
         else:
             print_text(_result_text(settings, result, save))
-        _agree(f"Do LEFT and RIGHT in {save} stand where yours are, facing forward? Write to {path}?", yes)
+        _agree(
+            "camera.write", f"Do LEFT and RIGHT in {save} stand where yours are, facing forward? Write to {path}?", yes
+        )
         backup = write_calibration(path, _changes(result))
         done(path, backup, json)
 
@@ -143,7 +146,7 @@ def _by_hand(path: Path, settings: Config, pose: dict[str, float], yes: bool, as
     calibration = with_pose(settings.camera.calibration, pose).model_copy(
         update={"calibrated_at": f"{datetime.now(UTC):%Y-%m-%d %H:%M} by hand", "residual_mm": 0.0, "residual_px": 0.0}
     )
-    _agree(f"Write this pose to {path}?", yes)
+    _agree("camera.write", f"Write this pose to {path}?", yes)
     backup = write_calibration(path, {"camera": {"calibration": calibration.model_dump()}})
     done(path, backup, as_json)
 
@@ -168,7 +171,11 @@ def _live(context: typer.Context, room: Path, angles_deg: str, yes: bool, as_jso
         print_text(
             f"The blade will turn to {', '.join(f'{angle:+g}' for angle in angles)} degrees, one after the other."
         )
-    _agree("Is the blade empty and just above level ground, and is everybody clear of it? Turn it now?", yes)
+    _agree(
+        "camera.clear",
+        "Is the blade empty and just above level ground, and is everybody clear of it? Turn it now?",
+        yes,
+    )
     answer = daemon.maneuver("camera.calibrate", LIVE_TIMEOUT_S, consent=True, angles_deg=angles)
     folder = room / _plain(answer["frame_set"])
     folder.mkdir()
@@ -273,9 +280,9 @@ def _changes(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def _agree(question: str, yes: bool) -> None:
+def _agree(key: str, question: str, yes: bool) -> None:
     if not yes:
-        agree("calibrate", question, "Add --yes to consent beforehand")
+        agree(key, question, "Add --yes to consent beforehand")
 
 
 def write_calibration(path: Path, changes: dict[str, Any]) -> Path | None:

@@ -13,8 +13,9 @@ from typing import Annotated
 import typer
 
 from graderd import places
+from graderd.cli.asking import agree
 from graderd.cli.classify import summary_text
-from graderd.cli.console import CliError, ExitCode, Json, agree, example, print_json, print_text
+from graderd.cli.console import CliError, ExitCode, Json, example, print_json, print_text
 from graderd.core.soil import ColorMethod
 from graderd.hal.errors import DeviceError
 
@@ -82,6 +83,6 @@ def _color(source: Path, method: ColorMethod, config: Path | None, yes: bool, as
             "calibrate color", short, 'Nothing was changed. Drive with method = "depth", which needs no light'
         )
     if not yes:
-        agree("calibrate", f"Are these frames of this site, in its light? Write to {path}?", "Add --yes to consent")
+        agree("color.write", f"Are these frames of this site, in its light? Write to {path}?", "Add --yes to consent")
     backup = write_calibration(path, {"perception": {"color": {"site_figure": figure.model_dump()}}})
     done(path, backup, as_json)

@@ -13,7 +13,8 @@ from typing import Annotated, Any
 import typer
 
 from graderd import places
-from graderd.cli.console import CliError, ExitCode, agree, client_of, example, print_text
+from graderd.cli.asking import agree, ask, one_of
+from graderd.cli.console import CliError, ExitCode, client_of, example, print_text
 from graderd.cli.move import move
 from graderd.client import Client
 from graderd.core.axes import LIFTS
@@ -46,7 +47,7 @@ def register(group: typer.Typer) -> None:
         """
         client = client_of(context)
         agree(
-            "lifts",
+            "lifts.clear",
             f"The left end of the blade will rise, the right one sink, by {by_deg:g} deg together. Is it clear?",
         )
         _tilt(client, by_deg)
@@ -73,13 +74,7 @@ def _tilt(client: Client, by_deg: float) -> None:
 
 def _ask() -> End:
     question = "Seen by who sits on the machine: which end of the blade rose? left, right or neither"
-    while True:
-        try:
-            answer = str(typer.prompt(question)).strip().lower()
-        except typer.Abort:
-            raise CliError("lifts", "cancelled; nothing was changed", "Do it again") from None
-        if answer in tuple(End):
-            return End(answer)
+    return End(ask("lifts.rose", question, one_of(*End)))
 
 
 def _exchange(client: Client, config: Path | None) -> None:
@@ -91,7 +86,7 @@ def _exchange(client: Client, config: Path | None) -> None:
     if left_n is None or right_n is None:
         raise CliError("lifts", "left and right are swapped", "Exchange them in the settings of their driver")
     print_text(f"Left and right are swapped: the left one is at address {right_n}, the right one at {left_n}")
-    agree("lifts", f"Write this into {path}?")
+    agree("lifts.write", f"Write this into {path}?")
     changes = {"lift_left": {"address_n": right_n}, "lift_right": {"address_n": left_n}}
     backup = write_calibration(path, changes)
     kept = f"; the former file is {backup}" if backup else ""

@@ -16,7 +16,8 @@ from typing import Annotated, Any
 import typer
 
 from graderd import places
-from graderd.cli.console import CliError, agree, client_of, example, print_text
+from graderd.cli.asking import agree, ask, one_of
+from graderd.cli.console import CliError, client_of, example, print_text
 from graderd.cli.move import move
 from graderd.client import Client, LeaseLostError, RefusedError
 
@@ -117,7 +118,7 @@ def register(group: typer.Typer) -> None:
         new = solve(running, angles)
         rows = [f"  {name:<9} {running[name]:>8g} -> {value:>8g}" for name, value in new.items()]
         print_text("\n".join(["rotation", *rows]))
-        agree(WHERE, f"Write this into {path}?")
+        agree("rotation.write", f"Write this into {path}?")
         if _running(client) != running:
             raise CliError(WHERE, "the daemon was restarted with another calibration", "Do it again")
         backup = write_calibration(path, {"rotation": new})
@@ -150,20 +151,23 @@ class _Talk:
     def angles(self, keep_limits: bool) -> Angles:
         """Ask for the blade in each place, and read its angle there."""
         how = "by hand" if self._mode == "disarmed" else "by jogs"
-        agree(WHERE, f"The blade will be turned {how}. Is everybody clear of it, and the blade clear of the ground?")
-        square_deg = self._place("Turn the blade square to the way the machine drives")
-        turned_deg = self._place("Turn it by 5 degrees or more, either way")
+        agree(
+            "rotation.clear",
+            f"The blade will be turned {how}. Is everybody clear of it, and the blade clear of the ground?",
+        )
+        square_deg = self._place("square", "Turn the blade square to the way the machine drives")
+        turned_deg = self._place("aside", "Turn it by 5 degrees or more, either way")
         back = _which_end()
         if keep_limits:
             return Angles(square_deg, turned_deg, back, None)
-        left_deg = self._place("Turn it as far as it may ever go with its left end to the back")
-        right_deg = self._place("Turn it as far as it may ever go with its right end to the back")
+        left_deg = self._place("left_back", "Turn it as far as it may ever go with its left end to the back")
+        right_deg = self._place("right_back", "Turn it as far as it may ever go with its right end to the back")
         return Angles(square_deg, turned_deg, back, (left_deg, right_deg))
 
-    def _place(self, what: str) -> float:
+    def _place(self, key: str, what: str) -> float:
         jogs = ", or a jog such as +5 or -0.5" if self._mode == "manual" else ""
         while True:
-            answer = _prompt(f"{what}. Press Enter when it stands there{jogs}")
+            answer = ask(f"rotation.{key}", f"{what}. Press Enter when it stands there{jogs}", str)
             if not answer:
                 angle_deg = self._still_deg()
                 print_text(f"read: {angle_deg:+.2f} deg")
@@ -191,7 +195,7 @@ class _Talk:
         """
         status: dict[str, Any] = self._client.get("/v1/status")
         if status["mode"] != self._mode:
-            cause = f"graderd became {status['mode']} meanwhile; nothing was changed"
+            cause = f"graderd became {status['mode']} meanwhile ({status['reason']}); nothing was changed"
             raise CliError(WHERE, cause, "Do it again when nobody else uses it")
         return status
 
@@ -216,14 +220,5 @@ class _Talk:
 
 
 def _which_end() -> str:
-    while True:
-        answer = _prompt("Seen by who sits on the machine: which end of the blade went to the back? left or right")
-        if answer.lower() in ("left", "right"):
-            return answer.lower()
-
-
-def _prompt(question: str) -> str:
-    try:
-        return str(typer.prompt(question, default="", show_default=False)).strip()
-    except typer.Abort:
-        raise CliError(WHERE, "cancelled; nothing was changed", "Do it again") from None
+    question = "Seen by who sits on the machine: which end of the blade went to the back? left or right"
+    return ask("rotation.back", question, one_of("left", "right"))

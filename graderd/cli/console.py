@@ -124,20 +124,6 @@ def example(*lines: str) -> str:
     return "\n\n".join(["Example:" if len(lines) == 1 else "Examples:", *lines])
 
 
-def agree(where: str, question: str, remedy: str = "Do it again") -> None:
-    """Ask the person, and go on with a yes only.
-
-    Raises:
-        CliError: no, or nobody there to ask.
-    """
-    try:
-        agreed = typer.confirm(question, default=False)
-    except typer.Abort:
-        agreed = False
-    if not agreed:
-        raise CliError(where, "cancelled; nothing was changed", remedy)
-
-
 _PACKAGE = Path(__file__).parents[1]
 TAKES_ANYTHING = {"allow_extra_args": True, "ignore_unknown_options": True, "allow_interspersed_args": False}
 

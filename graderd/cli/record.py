@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from graderd import places
-from graderd.cli.console import CliError, ExitCode, Json, agree, client_of, example, print_json, print_table, print_text
+from graderd.cli.asking import agree
+from graderd.cli.console import CliError, ExitCode, Json, client_of, example, print_json, print_table, print_text
 from graderd.client import NoDaemonError
 from graderd.hal.errors import DeviceError
 
@@ -118,7 +119,7 @@ def _reading(group: typer.Typer) -> None:
         gone = _to_prune(store.entries(), keep_mb, older_days, incidents)
         size_mb = sum(entry.size_n for entry in gone) / 1e6
         if gone and not yes:
-            agree("record prune", f"Remove {len(gone)} recordings, {size_mb:.1f} MB, for good?", "Give --yes")
+            agree("record.prune", f"Remove {len(gone)} recordings, {size_mb:.1f} MB, for good?", "Give --yes")
         for entry in gone:
             entry.path.unlink(missing_ok=True)
         if json:
