@@ -188,19 +188,41 @@ def _ports(config: Config) -> dict[str, str]:
     return {name: str(port) for name, port in found.items() if port}
 
 
+@dataclass(frozen=True, slots=True)
+class UsbCamera:
+    """A camera on USB, as the kernel tells of it."""
+
+    product: str
+    serial: str
+    speed_mbit_per_s: str
+    device_release: str
+
+
+def realsense_cameras(root: Path) -> list[UsbCamera]:
+    """The RealSense cameras on USB. ``root``: see :class:`Machine`."""
+
+    def told(device: Path, name: str) -> str:
+        try:
+            return (device / name).read_text("utf-8", "replace").strip()
+        except OSError:
+            return ""
+
+    return [
+        UsbCamera(*(told(device, name) for name in ("product", "serial", "speed", "bcdDevice")))
+        for device in sorted((root / "sys/bus/usb/devices").glob("*"))
+        if told(device, "idVendor") == CAMERA_VENDOR and "RealSense" in told(device, "product")
+    ]
+
+
 def _camera(machine: Machine) -> Iterator[Finding]:
     if machine.config.camera.source != "realsense":
         yield Finding("camera", Verdict.NOTE, f"pictures come from '{machine.config.camera.source}': no USB to look at")
         return
-    found = 0
-    for device in sorted(machine.at("/sys/bus/usb/devices").glob("*")):
-        names = ("idVendor", "product", "serial", "speed", "bcdDevice")
-        told = {name: (machine.text(device.relative_to(machine.root) / name) or "") for name in names}
-        if told["idVendor"] != CAMERA_VENDOR or "RealSense" not in told["product"]:
-            continue
-        found += 1
-        seen = f"{told['product']} {told['serial']}: {told['speed']} Mbit/s, device release {told['bcdDevice']}"
-        if float(told["speed"] or 0) < USB3_MBIT_PER_S:
+    found = realsense_cameras(machine.root)
+    for camera in found:
+        seen = f"{camera.product} {camera.serial}: {camera.speed_mbit_per_s} Mbit/s"
+        seen += f", device release {camera.device_release}"
+        if float(camera.speed_mbit_per_s or 0) < USB3_MBIT_PER_S:
             yield Finding(
                 "camera", Verdict.FAIL, f"{seen}: USB 2", "use a USB 3 cable and port (blue), no hub; lsusb -t"
             )

@@ -1,14 +1,51 @@
-"""``graderd rig scene | drive | halt``: tells the rig of a running daemon what to do."""
+"""``graderd rig scene | drive | halt | turn | press | release | unplug | plug``: what a person does at a machine, done
+at a simulated grader: lay soil, drive, turn the blade by hand, press the stop, pull a plug."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
+import time
+from pathlib import Path
+from typing import Any, Final
 
 from graderd.hal.errors import DeviceError
 from graderd.simulator.control_client import rig_request
 from graderd.simulator.grader.piles import SceneZone
+
+PLUGS: Final = {"servo": ("servo", "servo_fault"), "can": ("actuators", "actuator_fault")}
+"""By adapter: the rig's part, and the command that takes its faults."""
+
+
+HAND_DEG: Final = 0.4
+HAND_S: Final = 0.02
+"""As quickly as a person turns a blade: 20 degrees a second. One that leaps is a fault."""
+
+
+def turn_by_hand(control: Path | str, angle_deg: float) -> None:
+    """Turn the unpowered blade to an angle.
+
+    Raises:
+        DeviceError: the rig says no, or is not there.
+    """
+    here_deg = float(rig_request(control, "state")["blade_deg"])
+    steps_n = max(1, round(abs(angle_deg - here_deg) / HAND_DEG))
+    for step_n in range(1, steps_n + 1):
+        rig_request(control, "turn_blade", angle_deg=here_deg + (angle_deg - here_deg) * step_n / steps_n)
+        time.sleep(HAND_S)
+
+
+def _request(given: dict[str, Any]) -> dict[str, Any]:
+    """The rig's own command for what a person does; most are called the same."""
+    match given["cmd"]:
+        case "press" | "release":
+            return {"command": "stop_loop", "state": "open" if given["cmd"] == "press" else "closed"}
+        case "unplug":
+            return {"command": PLUGS[given["adapter"]][1], "name": "unplug"}
+        case "plug":
+            return {"command": "clear_faults", "part": PLUGS[given["adapter"]][0]}
+    return {"command": given.pop("cmd"), **given}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -23,9 +60,19 @@ def main(arguments: list[str] | None = None) -> int:
     drive.add_argument("--distance-m", type=float, default=3.0)
     drive.add_argument("--speed-m-per-s", type=float, default=0.5, help="negative: back")
     commands.add_parser("halt", help="brake")
+    turn = commands.add_parser("turn", help="turn the unpowered blade by hand")
+    turn.add_argument("angle_deg", type=float)
+    commands.add_parser("press", help="press the button in the stop loop")
+    commands.add_parser("release", help="release it")
+    for name, what in (("unplug", "pull an adapter's plug"), ("plug", "plug it in again")):
+        commands.add_parser(name, help=what).add_argument("adapter", choices=list(PLUGS))
     given = vars(parser.parse_args(arguments))
     try:
-        answer = rig_request(given.pop("control"), given.pop("cmd"), **given)
+        if given["cmd"] == "turn":
+            turn_by_hand(given["control"], given["angle_deg"])
+            return 0
+        control, request = given.pop("control"), _request(given)
+        answer = rig_request(control, request.pop("command"), **request)
     except DeviceError as error:
         sys.stderr.write(f"graderd: rig: {error}\n")
         return 1

@@ -8,15 +8,15 @@ import time
 from types import TracebackType
 from typing import Any, Protocol, Self
 
-from rich.console import Console, Group
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
 from rich.live import Live
-from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from graderd.core.status import AxisStatus, Status
+from graderd.core.status import Status
+from graderd.view import LEAST_COLUMNS_N, LEAST_LINES_N, STYLES, Line, fitting, lines
 
-BAR_N = 24
 EVENTS_SHOWN_N = 6
 
 
@@ -83,13 +83,14 @@ class LineShow:
 
 
 class PanelShow:
-    """A panel a person can follow."""
+    """What a person can follow, in whatever room the terminal has; what came of it stays on the screen at the end."""
 
-    def __init__(self) -> None:
-        self._console = Console()
-        self._live = Live(console=self._console, refresh_per_second=12, transient=False)
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or Console()
+        self._live = Live(console=self._console, refresh_per_second=12, transient=True)
         self._events: list[str] = []
         self._start_s = time.monotonic()
+        self._finished: dict[str, Any] | None = None
 
     def __enter__(self) -> Self:
         self._live.__enter__()
@@ -99,80 +100,51 @@ class PanelShow:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._live.__exit__(kind, error, trace)
+        if self._finished is not None:
+            self._console.print(_passes_table(self._finished["passes"]))
+            reason = self._finished["reason"]
+            self._console.print(
+                Text(f"failed: {reason}", "red") if reason else Text("all passes as they must", "green")
+            )
 
     def event(self, event: str, **fields: Any) -> None:
         if event == "demo_finished":
-            self._live.console.print(_passes_table(fields["passes"]))
-            if fields["reason"]:
-                self._live.console.print(Text(f"failed: {fields['reason']}", "red"))
+            self._finished = fields
             return
         told = ", ".join(f"{key} {_plain(value)}" for key, value in fields.items())
         self._events.append(f"{time.monotonic() - self._start_s:6.1f} s  {event}  {told}")
         if event == "starting":
-            self._live.update(Panel(f"starting the {fields['what']} …", title="graderd"))
+            self._live.update(Text(f"starting the {fields['what']} …"))
 
     def status(self, status: Status) -> None:
-        body = Group(_soil(status), _axes(status), _faults(status), Text("\n".join(self._events[-EVENTS_SHOWN_N:])))
-        self._live.update(Panel(body, title=f"graderd  {status.mode}: {status.reason}", border_style=_color(status)))
+        self._live.update(self.frame(status))
+
+    def frame(self, status: Status) -> Text:
+        """The screen: soil as bars, the status, what happened last. A line stays free below it."""
+        columns_n = max(self._console.width, LEAST_COLUMNS_N)
+        lines_n = max(self._console.height, LEAST_LINES_N) - 1
+        bars = _bars(status, columns_n)
+        events = self._events[-min(EVENTS_SHOWN_N, lines_n // 4) :]
+        room_n = lines_n - len(bars) - len(events)
+        shown = lines(status.model_dump(mode="json"), columns_n, room_n)
+        told = [Line(fitting(event, columns_n), "dim") for event in events]
+        return Text("\n").join(Text(line.text, STYLES[line.kind], no_wrap=True) for line in [*bars, *shown, *told])
 
 
-def _color(status: Status) -> str:
-    return {"stopped": "red", "auto": "green", "manual": "cyan"}.get(str(status.mode), "white")
-
-
-def _soil(status: Status) -> Table:
-    soil = status.soil
-    table = Table(title="soil in front of the blade, as the operator sees it (left | center | right)", expand=True)
+def _bars(status: Status, columns_n: int) -> list[Line]:
+    """The soil by thirds as the operator sees it, one bar each."""
+    width_n = columns_n - len("center 100 % ")
+    found = []
     for name in ("left", "center", "right"):
-        table.add_column(name, justify="center")
-    bars = []
-    for name in ("left", "center", "right"):
-        share = getattr(soil, f"share_{name}")
-        litres = getattr(soil, f"volume_{name}_l")
-        bar = "█" * round((share or 0.0) * BAR_N)
-        style = "bold green" if soil.zone == name else "yellow"
-        bars.append(
-            Text(
-                f"{bar or '·'}\n{'?' if share is None else f'{share:4.0%}'}"
-                + (f"  {litres:.1f} l" if litres is not None else ""),
-                style,
-            )
-        )
-    table.add_row(*bars)
-    age = f"{soil.age_s * 1e3:.0f} ms old, {soil.frames_per_s:.0f} frames/s" if soil.age_s is not None else "no picture"
-    table.caption = (
-        f"zone {soil.zone} ({soil.confidence:.0%}, {soil.reason}; {age}) — decision: {status.decision.reason}"
-    )
-    return table
-
-
-def _axes(status: Status) -> Table:
-    table = Table(expand=True)
-    for column in ("axis", "requested", "limited", "sent", "measured", "", "state"):
-        table.add_column(column, justify="right" if column not in ("axis", "", "state") else "left")
-    for axis in status.axes.values():
-        table.add_row(
-            axis.name,
-            *(_number(value) for value in (axis.requested, axis.limited, axis.sent, axis.measured)),
-            axis.unit,
-            _axis_state(axis),
-        )
-    return table
-
-
-def _axis_state(axis: AxisStatus) -> str:
-    moving = "?" if axis.moving is None else "moving" if axis.moving else "at rest"
-    return f"{axis.lifecycle}, {moving}" + (f", {', '.join(axis.flags)}" if axis.flags else "")
-
-
-def _faults(status: Status) -> Text:
-    lines = [f"{fault.name}: {fault.reads} — {fault.remedy}" for fault in status.faults]
-    lines += [f"holding: {reason}" for reason in status.holding]
-    return Text("\n".join(lines) if lines else "no faults", style="red" if lines else "green")
+        share = getattr(status.soil, f"share_{name}")
+        told = "   ?  " if share is None else f"{share:4.0%}  "
+        bar = "█" * round((share or 0.0) * width_n)
+        found.append(Line(f"{name:6} {told}{bar}", "title" if status.soil.zone == name else "plain"))
+    return found
 
 
 def _passes_table(passes: list[dict[str, Any]]) -> Table:
-    table = Table(title="passes")
+    table = Table(title="passes", box=SIMPLE_HEAD)
     for column in ("soil", "decided", "requested", "measured", "settled in"):
         table.add_column(column, justify="right")
     for one in passes:
@@ -184,10 +156,6 @@ def _passes_table(passes: list[dict[str, Any]]) -> Table:
             f"{one['settle_s']:.2f} s",
         )
     return table
-
-
-def _number(value: float | None) -> str:
-    return "—" if value is None else f"{value:.1f}"
 
 
 def _plain(value: Any) -> str:

@@ -27,9 +27,11 @@ from graderd.cli import (
     replay,
     report,
     rotation,
+    setup,
     status,
     study,
     token,
+    watch,
 )
 from graderd.cli.console import CliError, ExitCode, print_error, print_text
 from graderd.client import ClientError
@@ -38,8 +40,10 @@ from graderd.hal.errors import DeviceError
 INTERRUPTED = 130
 """What typer makes of Ctrl-C."""
 COMMANDS = (
+    setup,
     processes,
     status,
+    watch,
     modes,
     move,
     explain,

@@ -111,6 +111,7 @@ def _rig(app: typer.Typer) -> None:
             "graderd rig experiment --out experiment",
             "graderd rig scene left              (lays soil before the blade of a running simulated grader)",
             "graderd rig drive --distance-m 3",
+            "graderd rig press --dir grader      (the button of its stop loop; 'release' lets go)",
             "graderd rig -- --help          (all its options)",
         ),
     )
@@ -119,16 +120,30 @@ def _rig(app: typer.Typer) -> None:
 
         Soil, blade, camera, virtual servo and virtual actuators in a process of their own, which announces itself in
         rig.json in its directory (a JSON object). 'dataset' writes a set of labelled frames instead; 'experiment'
-        drives passes over soil left, center and right at three angles with its own daemon and measures them; 'scene',
-        'drive' and 'halt' tell the rig of the daemon that runs what to do. Further arguments are the rig's own.
+        drives passes over soil left, center and right at three angles with its own daemon and measures them. 'scene',
+        'drive', 'halt', 'turn', 'press', 'release', 'unplug' and 'plug' do at the rig of the daemon that runs, or at
+        that of --dir, what a person does at a machine. Further arguments are the rig's own.
         """
         arguments = context.args
         if arguments[:1] and arguments[0] in ("dataset", "experiment"):
             hand_over(f"graderd.simulator.{arguments[0]}", arguments[1:])
-        elif arguments[:1] and arguments[0] in ("scene", "drive", "halt"):
-            hand_over("graderd.simulator.ask", [_control_of(client_of(context)), *arguments])
+        elif arguments[:1] and arguments[0] in AT_THE_RIG:
+            directory, rest = _directory(arguments[1:])
+            control = str(directory / "control.sock") if directory else _control_of(client_of(context))
+            hand_over("graderd.simulator.ask", [control, arguments[0], *rest])
         else:
             hand_over("graderd.simulator", arguments)
+
+
+AT_THE_RIG = ("scene", "drive", "halt", "turn", "press", "release", "unplug", "plug")
+
+
+def _directory(arguments: list[str]) -> tuple[Path | None, list[str]]:
+    """``--dir DIR`` taken out of a rig's arguments."""
+    if "--dir" not in arguments[:-1]:
+        return None, arguments
+    at = arguments.index("--dir")
+    return Path(arguments[at + 1]), arguments[:at] + arguments[at + 2 :]
 
 
 def _control_of(client: Client) -> str:

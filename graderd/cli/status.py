@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import time
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,10 +18,13 @@ from graderd.cli.console import (
     print_json,
     print_rich,
     print_text,
-    rich_table,
 )
 from graderd.client import Client
 from graderd.hal.text import printable
+from graderd.view import LEAST_COLUMNS_N, LEAST_LINES_N, STYLES, lines
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
 
 THERMAL_SHOWN = 0.05
 THIRDS = ("left", "center", "right")
@@ -38,7 +42,10 @@ def register(app: typer.Typer) -> None:
         watch: Annotated[bool, typer.Option("--watch", help="Go on showing it until Ctrl-C.")] = False,
         json: Json = False,
     ) -> None:
-        """Show mode, axes, soil, faults, readiness and health."""
+        """Show mode, axes, soil, faults, readiness and health.
+
+        A terminal gets what fits it, faults first; a pipe gets everything.
+        """
         client = client_of(context)
         if watch:
             _watch(client, json)
@@ -47,7 +54,7 @@ def register(app: typer.Typer) -> None:
         if json:
             print_json(state)
         elif for_people():
-            print_rich(*(rich_table(*section) for section in sections(state)))
+            print_rich(_on_terminal(state))
         else:
             print_text("\n".join(plain_table(*section) for section in sections(state)))
 
@@ -63,14 +70,22 @@ def _watch(client: Client, as_json: bool) -> None:
                     else:
                         print_text(summary(state))
             return
-        from rich.console import Group
         from rich.live import Live
 
         with client.raw_statuses(10.0) as states, Live(auto_refresh=False, screen=True) as live:
             for state in states:
-                live.update(Group(*(rich_table(*section) for section in sections(state))), refresh=True)
+                live.update(_on_terminal(state), refresh=True)
     except KeyboardInterrupt:
         return
+
+
+def _on_terminal(state: dict[str, Any]) -> RenderableType:
+    """What fits; a line stays for the shell's next prompt."""
+    from rich.text import Text
+
+    columns_n, lines_n = shutil.get_terminal_size()
+    shown = lines(state, max(columns_n, LEAST_COLUMNS_N), max(lines_n, LEAST_LINES_N) - 1)
+    return Text("\n").join(Text(line.text, STYLES[line.kind], no_wrap=True) for line in shown)
 
 
 def summary(state: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
@@ -300,6 +301,10 @@ class Config(Settings):
                     f"lift_pair.min_share ({pair.min_share:g}) of {axis}.speed_percent ({section.speed_percent}) is "
                     f"below the {LEAST_DUTY_PERCENT} % duty at which a lift moves; raise it"
                 )
+
+    def sha256(self) -> str:
+        """Digest of the whole, defaults included: recordings and the commissioning record name it."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
     def lifts(self) -> dict[str, ActuatorSettings]:
         """The sections of the two lifts by axis."""

@@ -481,7 +481,6 @@ def _frames_of(run: Path) -> Path:
 
 def head_of(config: Config) -> dict[str, str]:
     """What every file says of where it comes from."""
-    whole = config.model_dump_json().encode()
     calibrated = (config.camera.calibration, config.rotation, config.attitude, config.blade)
     calibration = b"".join(part.model_dump_json().encode() for part in calibrated)
     return {
@@ -490,7 +489,7 @@ def head_of(config: Config) -> dict[str, str]:
         "machine": platform.machine(),
         "simulated": str(config.simulated).lower(),
         "tick_hz": f"{config.control.tick_hz:g}",
-        "config_sha256": hashlib.sha256(whole).hexdigest(),
+        "config_sha256": config.sha256(),
         "calibration_id": hashlib.sha256(calibration).hexdigest()[:12],
     }
 

@@ -84,7 +84,7 @@ class Machine:
     def __init__(self, servo_link: Path, can_link: Path, can_bus: can.BusABC | None, seed: int) -> None:
         self.world = World()
         self.servo = TimedServo(servo_id=1, seed=seed, plant=PlantSettings(stops_deg=STOPS_DEG))
-        self.servo_bus = VirtualServoBus([self.servo], servo_link)
+        self.servo_bus = VirtualServoBus([self.servo], servo_link, strict_baud=True)
         self.lift_left = VirtualElectrak("electrak_hd_b017", _ADDRESSES["lift_left"], GROUND_LIFT_MM, seed)
         self.lift_right = VirtualElectrak("electrak_hd_b017", _ADDRESSES["lift_right"], GROUND_LIFT_MM, seed + 1)
         self.tilt = VirtualElectrak("electrak_md_a050", _ADDRESSES["tilt"], LEVEL_TILT_MM, seed + 2)

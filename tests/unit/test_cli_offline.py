@@ -40,8 +40,10 @@ def test_every_command_has_help_with_an_example_and_json(words: list[str]) -> No
     assert "Example" in result.output
     assert f"graderd {' '.join(words)}" in " ".join(result.output.split())
     # `rig` and `can dump` hand over to programs that know --json themselves or announce themselves as JSON.
-    # `can database` writes a file in another tool's format; `calibrate lifts` and `rotation` are talks with a person.
-    told_otherwise = words in (["can", "database"], ["calibrate", "lifts"], ["calibrate", "rotation"])
+    # `can database` writes a file in another tool's format; `calibrate lifts`, `calibrate rotation` and `setup` are
+    # talks with a person, and `watch` is a screen.
+    talks = (["calibrate", "lifts"], ["calibrate", "rotation"], ["setup"], ["watch"])
+    told_otherwise = words in (["can", "database"], *talks)
     assert told_otherwise or "--json" in result.output or "JSON" in result.output
 
 

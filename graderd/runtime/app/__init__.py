@@ -49,3 +49,10 @@ def problems(config: Config) -> list[str]:
     from graderd.runtime.app.devices import problems as find
 
     return find(config)
+
+
+def on_rig(config: Config, directory: Path) -> Config:
+    """See :func:`graderd.runtime.app.sim.attach`."""
+    from graderd.runtime.app.sim import attach
+
+    return attach(config, directory)

@@ -1,0 +1,192 @@
+"""The machine's status as lines for a terminal of a given size: ``graderd status`` prints them, ``watch`` keeps them.
+
+Faults come first, each with its remedy. A number is never cut: words are, at their end, and lines that say least go
+first where there is no room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
+
+from graderd.hal.text import printable
+
+Kind = Literal["title", "fault", "stop", "warn", "plain", "dim"]
+Status = Mapping[str, Any]
+THIRDS: Final = ("left", "center", "right")
+LEAST_COLUMNS_N: Final = 60
+LEAST_LINES_N: Final = 20
+NARROW_N: Final = 80
+BADLY: Final = ("stop", "disarm")
+MARK: Final = "…"
+STYLES: Final[Mapping[Kind, str]] = {
+    "title": "bold",
+    "fault": "bold red",
+    "stop": "bold white on red",
+    "warn": "yellow",
+    "plain": "",
+    "dim": "dim",
+}
+"""How rich shows each kind; what is dim or coloured says the same in its words."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line. ``weight``: what has less goes first where there is no room; 0 stays."""
+
+    text: str
+    kind: Kind = "plain"
+    weight: int = field(default=0, compare=False)
+
+
+def lines(status: Status, columns_n: int, lines_n: int) -> list[Line]:
+    """The status in so much room."""
+    found = [*_head(status), *_faults(status, columns_n), *_axes(status, columns_n), *_soil(status), *_rest(status)]
+    found = [Line(fitting(printable(line.text), columns_n), line.kind, line.weight) for line in found]
+    while len(found) > lines_n and any(line.weight for line in found):
+        heaviest = max(line.weight for line in found)
+        found.remove(next(line for line in reversed(found) if line.weight == heaviest))
+    if len(found) > lines_n:
+        left_out = len(found) - lines_n + 1
+        found = [*found[: lines_n - 1], Line(f"{MARK} {left_out} more lines: graderd status --json", "warn")]
+    return found
+
+
+def fitting(text: str, columns_n: int) -> str:
+    """The text in so many columns, cut between words where it is too long, and never in a number."""
+    if len(text) <= columns_n:
+        return text
+    kept = text[: columns_n - len(MARK)]
+    if text[len(kept)] != " ":
+        kept = kept[: kept.rfind(" ") + 1] if " " in kept.strip() else kept
+    kept = kept.rstrip()
+    # A number stands with its unit: "3.1" alone would say less than it did.
+    words = kept.split(" ")
+    while len(words) > 1 and words[-1][-1:].isdigit():
+        words.pop()
+    return " ".join(words).rstrip(" ,;:") + MARK
+
+
+def number(value: float | None, unit: str, digits: int = 1) -> str:
+    """``12.3 deg``; what is not known is a dash, and never a number."""
+    return "-" if value is None else f"{value:z.{digits}f} {unit}"
+
+
+def _head(status: Status) -> Iterator[Line]:
+    mode, arming = status["mode"], " (arming)" if status["arming"] else ""
+    kind: Kind = "stop" if mode == "stopped" else "title"
+    yield Line(f"{str(mode).upper()}{arming}: {status['reason']}", kind)
+    lease = status["lease"]
+    if lease is not None:
+        yield Line(f"moved by {lease['client']}, {lease['remaining_s']:.1f} s left", "warn")
+    for reason in status["holding"]:
+        yield Line(f"holding: {reason}", "warn", 2)
+    if status["last_stop"] and mode != "stopped":
+        yield Line(f"last stop: {status['last_stop']}", "dim", 7)
+
+
+def _faults(status: Status, columns_n: int) -> Iterator[Line]:
+    for fault in status["faults"]:
+        over = "" if fault["present"] else " (over)"
+        kind: Kind = "fault" if fault["reaction"] in BADLY else "warn"
+        yield Line(f"! {fault['name']}{over}, {fault['reaction']}: {fault['reads']}", kind)
+        yield from (Line(f"  > {part}", kind, 1) for part in _wrapped(fault["remedy"], columns_n - 4, 2))
+        if fault["detail"]:
+            yield Line(f"    {fault['detail']}", kind, 5)
+    if not status["faults"]:
+        yield Line("no faults", "dim", 3)
+    for need in status["readiness"]:
+        if not need["met"]:
+            what = "not ready" if need["mandatory"] else "missing"
+            yield Line(
+                f"{what}: {need['name']}, {need['reason']} > {need['remedy']}", "warn", 1 if need["mandatory"] else 4
+            )
+
+
+def _wrapped(text: str, columns_n: int, lines_n: int) -> list[str]:
+    """Words in at most so many lines."""
+    found: list[str] = []
+    rest = text
+    while rest and len(found) < lines_n:
+        if len(found) == lines_n - 1:
+            found.append(rest)
+            break
+        kept = rest if len(rest) <= columns_n else rest[: columns_n + 1].rpartition(" ")[0] or rest[:columns_n]
+        found.append(kept)
+        rest = rest[len(kept) :].strip()
+    return found
+
+
+def _axes(status: Status, columns_n: int) -> Iterator[Line]:
+    wide = columns_n > NARROW_N
+    header = ["axis", "state", "wanted", "measured", "age"]
+    header += ["limited", "sent", "current", "temp."] if wide else []
+    rows = [[*header, "" if columns_n < NARROW_N else "notes"]]
+    for axis in status["axes"].values():
+        unit = axis["unit"]
+        row = [
+            axis["name"],
+            axis["lifecycle"],
+            number(axis["requested"], unit),
+            number(axis["measured"], unit),
+            number(axis["measured_age_s"], "s", 2),
+        ]
+        if wide:
+            row += [number(axis["limited"], unit), number(axis["sent"], unit)]
+            row += [number(axis["current_a"], "A"), number(axis["temperature_c"], "°C", 0)]
+        rows.append([*row, _note(axis)])
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
+    for place, row in enumerate(rows):
+        cells = [
+            cell.ljust(width) if column < 2 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row[:-1], widths, strict=True))
+        ]
+        moving = place > 0 and row[-1].startswith("moving")
+        yield Line("  ".join([*cells, row[-1]]).rstrip(), "dim" if place == 0 else "warn" if moving else "plain")
+
+
+def _note(axis: Mapping[str, Any]) -> str:
+    notes = ["moving"] if axis["moving"] else []
+    notes += [axis["limited_because"], *(axis["flags"] or ())]
+    return ", ".join(note for note in notes if note)
+
+
+def _soil(status: Status) -> Iterator[Line]:
+    soil = status["soil"]
+    sure = f", {soil['confidence']:.0%} sure" if soil["zone"] != "unknown" else ""
+    yield Line(f"soil {soil['zone']}{sure}, {number(soil['age_s'], 's old', 2)}: {soil['reason']}")
+    thirds = [f"{third} {soil[f'share_{third}']:.0%}" for third in THIRDS if soil[f"share_{third}"] is not None]
+    if thirds:
+        yield Line(f"  shares   {'  '.join(thirds)}", "plain", 6)
+    for name in ("ahead", "carried"):
+        litres = soil[name]
+        if litres is not None:
+            told_l = "  ".join(f"{third} {litres[third + '_l']:.1f} l" for third in THIRDS)
+            yield Line(f"  {name.ljust(8)} {told_l}")
+    decision = status["decision"]
+    angle = "none" if decision["zone"] is None else number(decision["angle_deg"], "deg")
+    because = f": {decision['reason']}" if decision["reason"] else ""
+    yield Line(f"decision {angle}{because}")
+
+
+def _rest(status: Status) -> Iterator[Line]:
+    blade, vehicle, camera = status["attitude"], status["vehicle"], status["camera"]
+    parts = (
+        f"height {number(blade['height_mm'], 'mm', 0)}",
+        f"slope {number(blade['slope_deg'], 'deg')}",
+        f"pitch {number(blade['pitch_deg'], 'deg')}",
+    )
+    yield Line(f"blade    {'  '.join(parts)}")
+    drives = number(vehicle["speed_m_per_s"], "m/s", 2)
+    yield Line(f"drives   {drives}" if vehicle["age_s"] is not None else "drives   not told", "plain", 4)
+    where, tick = "simulated" if status["simulated"] else "machine", status["tick"]
+    late = f"p99 {tick['lateness_p99_ms']:.1f} ms late, {tick['overruns_n']} overruns"
+    yield Line(f"graderd  {status['version']} ({where}), {tick['rate_hz']:.0f} Hz, {late}", "dim", 8)
+    restarts = f", restarted {camera['restarts_n']} times" if camera["restarts_n"] else ""
+    yield Line(f"camera   {camera['lifecycle']}{restarts}, {camera['description']}", "plain", 5)
+
+
+def shown(found: Sequence[Line]) -> str:
+    """As plain text."""
+    return "\n".join(line.text for line in found)
