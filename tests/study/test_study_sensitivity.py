@@ -10,6 +10,7 @@ import pytest
 
 from graderd.studies.blade_rotation import sensitivity
 from graderd.studies.blade_rotation.case import Sense
+from graderd.studies.blade_rotation.engine import StudyError
 from graderd.studies.blade_rotation.sensitivity import ANGLES_DEG, CLAIMS, DEFINITIONS, DISTANCES_M, F64, FACTORS, Data
 from graderd.studies.blade_rotation.store import Store
 
@@ -89,3 +90,5 @@ def test_the_page_says_where_the_rule_holds_and_where_not(data: Data) -> None:
 
 def test_points_without_all_their_runs_are_not_counted(tmp_path: Path) -> None:
     assert len(sensitivity.collect(Store(tmp_path), 8).points) == 0
+    with pytest.raises(StudyError, match="0 piles have been run"):
+        sensitivity.write(Store(tmp_path), 8)
