@@ -14,6 +14,7 @@ from graderd.evaluation.bed import Bed, Grid, Points, bed_of, common_grid
 from graderd.evaluation.depth_files import Reader, find, span_of
 from graderd.evaluation.experiment import Case, Experiment, Trial
 from graderd.evaluation.ground import F64, NoGroundError
+from graderd.evaluation.load import load
 from graderd.evaluation.measures import (
     EVERYWHERE,
     Blade,
@@ -153,5 +154,4 @@ class _Work:
             raise ProtocolError(f"{path}:{rows.line_num}", f"{column}: {error}", "Newtons as plain numbers") from None
         if not loads or not np.isfinite(loads).all():
             raise ProtocolError(str(path), f"column {column} holds no finite loads", "Newtons as plain numbers")
-        found = {"blade_load_n": float(np.mean(loads)), "blade_load_max_n": float(np.max(loads))}
-        return {name: Estimate(value, math.inf, math.inf) for name, value in found.items()}
+        return {name: Estimate(value, math.inf, math.inf) for name, value in load(loads).items()}

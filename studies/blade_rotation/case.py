@@ -60,7 +60,7 @@ class BladeShape(_Data):
 
     length_m: Annotated[float, Field(gt=0, le=10)]
     height_m: Annotated[float, Field(gt=0, le=2)]
-    radius_m: Annotated[float, Field(gt=0, le=5)] | None
+    radius_m: Annotated[float, Field(gt=0, le=5)] | None = None
     edge_share: Annotated[float, Field(gt=0, lt=1)] = 0.25
     """Share of the height that is the straight cutting edge."""
 

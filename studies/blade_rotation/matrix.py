@@ -25,6 +25,8 @@ from graderd.studies.blade_rotation.store import Result
 CONFIDENCE = 0.95
 SIMILAR_SHARE = 0.02
 """Values of the study that differ by less are similar, as it calls loads 0.9 % apart; it claims no order of them."""
+SIMILAR_MM = 0.5
+"""So are heights that differ by no more (2.5: similar results for all three angles)."""
 OFFSET_SHARE = 0.2
 DESIRED_HEIGHT_M = 0.15
 """Of flattening, which the study does not print: a layer poured 0.25 m high slumps to 0.2 m or so, and a quarter of
@@ -162,7 +164,7 @@ class Table:
         claims none."""
         line = self.line(name)
         values = line.study.get(measure)
-        return None if values is None else reproduced(line.angles_deg, values, self._difference(name, measure))
+        return None if values is None else reproduced(measure, line.angles_deg, values, self._difference(name, measure))
 
     def orders(self) -> dict[str, bool | None]:
         """By line, for the measure that the study decides by."""
@@ -173,19 +175,27 @@ class Table:
         return next((each for each in self.differences if (each.case, each.measure) == wanted), None)
 
 
-def reproduced(angles_deg: Sequence[float], values: Sequence[float], found: Difference | None) -> bool | None:
-    """Whether differences between angles have the signs that the study's ``values`` have. Of heights the size counts:
-    they are all below the target."""
+def claimed(measure: str, values: Sequence[float]) -> list[tuple[int, int]]:
+    """Which pairs of the study's values, by their places, are far enough apart to have an order. Of heights the size
+    counts: they are all below the target."""
     sizes = np.abs(values)
+    least = SIMILAR_MM + 1e-9 if measure == HEIGHT else SIMILAR_SHARE * float(sizes.max())
+    return [(a, b) for a, b in combinations(range(len(sizes)), 2) if abs(sizes[a] - sizes[b]) >= least]
+
+
+def reproduced(
+    measure: str, angles_deg: Sequence[float], values: Sequence[float], found: Difference | None
+) -> bool | None:
+    """Whether differences between angles have the signs that the study's ``values`` have."""
+    if found is None:
+        return None
+    by_angles = {(pair.angle_deg, pair.other_deg): pair for pair in found.pairs}
     told = []
-    for (a, one), (b, other) in combinations(zip(angles_deg, sizes, strict=True), 2):
-        if abs(one - other) < SIMILAR_SHARE * max(one, other):
-            continue
-        if found is None:
-            return None
-        pair = next(pair for pair in found.pairs if (pair.angle_deg, pair.other_deg) == (a, b))
+    for a, b in claimed(measure, values):
+        pair = by_angles[angles_deg[a], angles_deg[b]]
         # How far apart they are in the study's direction, at least and at most.
-        least, most = (pair.low, pair.high) if one > other else (-pair.high, -pair.low)
+        falls = abs(values[a]) > abs(values[b])
+        least, most = (pair.low, pair.high) if falls else (-pair.high, -pair.low)
         told.append(True if least > 0.0 else False if most < 0.0 else None)
     if not told or (None in told and False not in told):
         return None

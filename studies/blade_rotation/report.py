@@ -25,11 +25,12 @@ from graderd.studies.blade_rotation import case as named
 from graderd.studies.blade_rotation import matrix, rule
 from graderd.studies.blade_rotation.case import Case
 from graderd.studies.blade_rotation.contact import SOIL_SOIL, SOIL_TOOL
-from graderd.studies.blade_rotation.matrix import AGAIN, HEIGHT, LOAD, SPREAD, Table
+from graderd.studies.blade_rotation.matrix import AGAIN, HEIGHT, LOAD, SPREAD, Line, Table
 from graderd.studies.blade_rotation.outcome import RULES, grid_over, surface
 from graderd.studies.blade_rotation.store import Result, Store, written
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Picture = npt.NDArray[np.uint8]
@@ -54,7 +55,7 @@ def write(store: Store) -> Path:
     found.lines[:] = [line for line in found.lines if any(row.case == line.name for row in found.rows)]
     parts = [
         f"<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
-        f"<title>{TITLE}</title><style>{STYLE}</style><body><h1>{TITLE}</h1>",
+        f"<title>{TITLE}</title><style>{STYLE} body {{ max-width: 80rem; }}</style><body><h1>{TITLE}</h1>",
         _summary(found, results),
         _parameters(),
         _tables(found),
@@ -163,7 +164,7 @@ def _tables(found: Table) -> str:
             for measure in SHOWN:
                 group = [row for row in found.rows if (row.case, row.measure) == (line.name, measure)]
                 for number_, row in enumerate(group):
-                    order = ORDERS[found.order(line.name, measure)] if measure in line.study and not number_ else ""
+                    order = "" if number_ else _order(found, line, measure)
                     body += _row(row, found.study_value(row), order)
         if body:
             names = (
@@ -186,6 +187,15 @@ def _tables(found: Table) -> str:
     return "\n".join(parts) + f"<p>Measures, as <code>graderd evaluate</code> takes them:</p><ul>{meanings}</ul>"
 
 
+def _order(found: Table, line: Line, measure: str) -> str:
+    values = line.study.get(measure)
+    if values is None:
+        return ""
+    if not matrix.claimed(measure, values):
+        return "the study claims none"
+    return ORDERS[found.order(line.name, measure)]
+
+
 def _meaning(measure: str) -> str:
     return DEFINITIONS[measure.replace(WITHOUT_CARRIED, "_mm")].format(edge_mm=RULES.edge_mm)
 
@@ -195,7 +205,9 @@ def _row(row: Row, said: float | None, order: str) -> str:
     inside = ""
     if said is not None and row.low is not None and row.high is not None:
         inside = "inside the interval" if row.low <= said <= row.high else "outside"
-    deviation = "" if said is None else f"{row.value - said:+.1f} ({(row.value / said - 1.0) * 100.0:+.0f} %)"
+    deviation = "" if said is None else f"{row.value - said:+.1f}"
+    if said is not None and row.measure != HEIGHT:
+        deviation += f" ({(row.value / said - 1.0) * 100.0:+.0f} %)"
     text = "<tr>" + "".join(f"<td>{cell}" for cell in cells) + f"<td class=mean>{number(row.value)}<td>{_interval(row)}"
     return (
         text + f"<td>{row.trials_n}<td>{number(said) if said is not None else ''}<td>{deviation}<td>{inside}<td>{order}"
@@ -208,82 +220,72 @@ def _interval(row: Row) -> str:
 
 def _plots(found: Table, store: Store, results: Sequence[Result]) -> str:
     """By angle with intervals; over the travel; along the blade."""
+    shown = [line for line in found.lines if line.study and not line.name.startswith(("right", "quarter, right"))]
+    scattered = [line for line in shown if line.order_by == SPREAD]
+    keys = {result.key for result in results}
+
+    def travelled(ax: Axes, cases: Sequence[Case], color: str) -> None:
+        for number_, case in enumerate(cases):
+            curve = store.table(case, "travel").to_pydict()
+            width = [math.nan if value is None else value for value in curve[SPREAD]]
+            label = None if number_ else f"{case.angle_deg:g}°"
+            ax.plot(curve["travel_m"], width, color=color, linewidth=0.8, label=label)
+
+    def loaded(ax: Axes, cases: Sequence[Case], color: str) -> None:
+        mean = np.mean([np.mean(store.table(case, "along").to_pydict()["load_n"], axis=0) for case in cases], axis=0)
+        place = ((np.arange(mean.size) + 0.5) / mean.size - 0.5) * cases[0].blade.length_m
+        ax.plot(place, mean, color=color, drawstyle="steps-mid", label=f"{cases[0].angle_deg:g}°")
+
+    parts = [_by_angle(found, shown)] if shown else []
+    for draw, x_label, y_label, caption in (
+        (travelled, "travel since contact [m]", "spread [mm]", "Degree of spread (extreme) if the pass ended there."),
+        (loaded, "along the blade, left positive [m]", "load [N a part]", "Load along the blade, mean over the pass."),
+    ):
+        if not scattered:
+            continue
+        figure, axes = _axes(len(scattered))
+        for line, ax in zip(scattered, axes, strict=False):
+            for angle, color in zip(line.angles_deg, COLORS, strict=False):
+                cases = [case for case in line.cases() if case.angle_deg == angle and case.key() in keys]
+                if cases:
+                    draw(ax, cases, color)
+            ax.set_title(line.name, fontsize=9)
+            ax.set_xlabel(x_label, fontsize=7)
+            ax.set_ylabel(y_label, fontsize=7)
+            ax.legend(fontsize=7)
+        parts.append(_figure(figure, caption))
+    return "<h2>Plots</h2>" + "\n".join(parts) if parts else ""
+
+
+def _axes(count: int) -> tuple[Figure, list[Axes]]:
+    """So many plots, four a row."""
     from matplotlib.figure import Figure
 
-    parts = ["<h2>Plots</h2>"]
-    shown = [line for line in found.lines if line.study and not line.name.startswith(("right", "quarter, right"))]
-    if not shown:
-        return ""
-    figure = Figure(figsize=(11.0, 2.7 * math.ceil(len(shown) / 4)), layout="constrained")
-    axes = figure.subplots(math.ceil(len(shown) / 4), 4, squeeze=False)
-    for ax in axes.flat:
+    rows = math.ceil(count / 4)
+    figure = Figure(figsize=(11.0, 2.7 * rows), layout="constrained")
+    axes = list(figure.subplots(rows, 4, squeeze=False).flat)
+    for ax in axes[count:]:
         ax.set_axis_off()
-    for line, ax in zip(shown, axes.flat, strict=False):
-        ax.set_axis_on()
-        group = [row for row in found.rows if (row.case, row.measure) == (line.name, line.order_by)]
-        for row in group:
+    for ax in axes:
+        ax.tick_params(labelsize=7)
+    return figure, axes
+
+
+def _by_angle(found: Table, shown: Sequence[Line]) -> str:
+    figure, axes = _axes(len(shown))
+    for line, ax in zip(shown, axes, strict=False):
+        for row in found.rows:
+            if (row.case, row.measure) != (line.name, line.order_by):
+                continue
             ax.plot([row.angle_deg] * row.trials_n, row.values, "o", color=COLORS[0], alpha=0.35, markersize=4)
             if row.low is not None and row.high is not None:
-                ax.errorbar(
-                    row.angle_deg, row.value, [[row.value - row.low], [row.high - row.value]], color=COLORS[0], fmt="s"
-                )
-        ax.plot(line.angles_deg, line.study[line.order_by], "x--", color=COLORS[1], label="study")
+                reach = [[row.value - row.low], [row.high - row.value]]
+                ax.errorbar(row.angle_deg, row.value, reach, color=COLORS[0], fmt="s")
+        ax.plot(line.angles_deg, line.study[line.order_by], "x--", color=COLORS[1])
         ax.set_title(line.name, fontsize=9)
         ax.set_ylabel(title_of(line.order_by), fontsize=7)
         ax.set_xticks(line.angles_deg)
-        ax.tick_params(labelsize=7)
-    parts.append(
-        _figure(figure, "By angle: dots are runs, squares means with their intervals, crosses the study's values.")
-    )
-    by_key = {result.key: result for result in results}
-    scattered = [line for line in shown if line.order_by == SPREAD and not line.name.startswith("quarter")]
-    figure = Figure(figsize=(11.0, 3.0), layout="constrained")
-    for line, ax in zip(scattered, np.atleast_1d(figure.subplots(1, max(1, len(scattered)), sharey=True)), strict=True):
-        for angle, color in zip(line.angles_deg, COLORS, strict=False):
-            curves = [
-                store.table(case, "travel").to_pydict()
-                for case in line.cases()
-                if case.angle_deg == angle and case.key() in by_key
-            ]
-            for curve in curves:
-                width = [math.nan if value is None else value for value in curve[SPREAD]]
-                ax.plot(
-                    curve["travel_m"],
-                    width,
-                    color=color,
-                    linewidth=0.8,
-                    label=f"{angle:g}°" if curve is curves[0] else None,
-                )
-        ax.set_title(line.name, fontsize=9)
-        ax.set_xlabel("travel since contact [m]", fontsize=8)
-        ax.set_ylabel("spread [mm]", fontsize=8)
-        ax.legend(fontsize=7)
-    parts.append(
-        _figure(
-            figure,
-            "Degree of spread (extreme) if the pass ended there; each run is a line.",
-        )
-    )
-    figure = Figure(figsize=(11.0, 3.0), layout="constrained")
-    for line, ax in zip(scattered, np.atleast_1d(figure.subplots(1, max(1, len(scattered)), sharey=True)), strict=True):
-        for angle, color in zip(line.angles_deg, COLORS, strict=False):
-            loads = [
-                np.mean(store.table(case, "along").to_pydict()["load_n"], axis=0)
-                for case in line.cases()
-                if case.angle_deg == angle and case.key() in by_key
-            ]
-            if loads:
-                mean = np.mean(loads, axis=0)
-                half = line.case.blade.length_m / 2.0
-                place = (np.arange(mean.size) + 0.5) / mean.size * 2.0 * half - half
-                ax.plot(place, mean, color=color, drawstyle="steps-mid", label=f"{angle:g}°")
-        ax.set_title(line.name, fontsize=9)
-        ax.set_xlabel("along the blade, left positive [m]", fontsize=8)
-        ax.set_ylabel("mean load [N a part]", fontsize=8)
-        ax.invert_xaxis()
-        ax.legend(fontsize=7)
-    parts.append(_figure(figure, "Load along the blade, mean over pass and seeds."))
-    return "\n".join(parts)
+    return _figure(figure, "By angle: dots are runs, squares means with their intervals, crosses the study's values.")
 
 
 def _pictures(found: Table, store: Store, results: Sequence[Result]) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from graderd.studies.blade_rotation import lammps, run
@@ -105,11 +106,10 @@ def sweep(
                 str(scheduler), f"no Dask scheduler answers ({error})", "Start one, or leave it out"
             ) from None
         folder = str(store.folder.resolve())
+        task = partial(_one, folder=folder, ranks_n=ranks_n, restart_particle_steps=restart_particle_steps)
         futures = {
-            client.submit(
-                _one, case.model_dump_json(), folder, ranks_n, restart_particle_steps, key=key, retries=RETRIES_N
-            ): case
-            for key, case in left.items()
+            client.submit(task, case.model_dump_json(), key=key, retries=RETRIES_N, priority=-number): case
+            for number, (key, case) in enumerate(left.items())
         }
         for future in as_completed(futures):
             case = futures[future]

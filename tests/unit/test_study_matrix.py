@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -101,11 +102,13 @@ def difference(*pairs: tuple[float, float]) -> Difference:
 
 def test_what_the_study_calls_similar_has_no_order() -> None:
     loads = (1154.5, 1144.7, 1144.1)
-    assert matrix.reproduced(ANGLES, loads, difference((1.0, 9.0), (1.0, 9.0), (1.0, 9.0))) is None
+    assert matrix.reproduced(LOAD, ANGLES, loads, difference((1.0, 9.0), (1.0, 9.0), (1.0, 9.0))) is None
+    heights = (-5.3, -4.8, -4.9)
+    assert matrix.reproduced(matrix.HEIGHT, ANGLES, heights, difference((1.0, 9.0), (1.0, 9.0), (-9.0, -1.0))) is None
     spreads = (1833.9, 2104.8, 1854.2)  # 15 and 45 are 1.1 % apart
-    assert matrix.reproduced(ANGLES, spreads, difference((-9.0, -1.0), (-5.0, 5.0), (1.0, 9.0))) is True
-    assert matrix.reproduced(ANGLES, spreads, difference((-9.0, -1.0), (-5.0, 5.0), (-1.0, 9.0))) is None
-    assert matrix.reproduced(ANGLES, spreads, difference((-9.0, 1.0), (-5.0, 5.0), (-9.0, -1.0))) is False
+    assert matrix.reproduced(SPREAD, ANGLES, spreads, difference((-9.0, -1.0), (-5.0, 5.0), (1.0, 9.0))) is True
+    assert matrix.reproduced(SPREAD, ANGLES, spreads, difference((-9.0, -1.0), (-5.0, 5.0), (-1.0, 9.0))) is None
+    assert matrix.reproduced(SPREAD, ANGLES, spreads, difference((-9.0, 1.0), (-5.0, 5.0), (-9.0, -1.0))) is False
 
 
 def test_a_rule_is_what_the_configuration_takes(tmp_path: Path) -> None:
@@ -157,6 +160,20 @@ def test_a_wrong_case_is_told_by_place_and_cause(tmp_path: Path, text: str, caus
         case_files.load(path)
     assert told.value.where == str(path)
     assert cause in told.value.cause
+
+
+def test_the_documentations_files_are_cases(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs/operators/blade-study.md").read_text(encoding="utf-8")
+    case, tables, swept = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    path = tmp_path / "file.toml"
+    path.write_text(case)
+    assert case_files.load(path).work is Work.LEFT
+    path.write_text(
+        "\n".join(line for line in case.splitlines() if not line.startswith(("blade", "pile"))) + "\n" + tables
+    )
+    assert case_files.load(path).blade.length_m == 2.4
+    path.write_text(swept)
+    assert len(case_files.load_sweep(path)) == 3 * 2 * 3 * 5
 
 
 def test_a_sweep_is_each_combination(tmp_path: Path) -> None:
