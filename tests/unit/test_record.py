@@ -63,7 +63,7 @@ from graderd.record.layout import (
 from graderd.record.reader import Recording, said
 from graderd.record.recorder import AFTER_S, BEFORE_S, Recorder, head_of
 from graderd.record.store import Store
-from harness.recording import NoEyes, record_until_killed
+from harness.recording import Feed, NoEyes, record_until_killed
 from harness.stretch import SETTINGS, stretch_of_work
 
 WORK = stretch_of_work()
@@ -305,6 +305,22 @@ def test_a_killed_recorder_loses_a_second_at_most(tmp_path: Path) -> None:
     """Shorter than ``python -m benchmarks.record``, which kills a hundred."""
     for number, after_s in enumerate((0.8, 1.3, 1.9)):
         assert record_until_killed(tmp_path / str(number), after_s) <= 1.0
+
+
+@pytest.mark.live
+async def test_a_starved_thread_keeps_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each rest takes as long as others leave it waiting: 0.3 ms become 50."""
+    rest = time.sleep
+    monkeypatch.setattr(recorder_module.time, "sleep", lambda seconds: rest(seconds + 0.05))
+    feed = Feed(tmp_path)
+    task = asyncio.create_task(feed.recorder.run())
+    await feed.ticks(3.0)
+    (path,) = tmp_path.glob("*.mcap")
+    *_, last = Recording(path).messages((TICK,))
+    lost_s = feed.now_s - said(last)["now_s"]
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    assert lost_s <= 1.0
 
 
 # ---- the disk --------------------------------------------------------------------------------------------------------
