@@ -1,4 +1,4 @@
-"""What recording costs, and what a kill leaves: ``python -m benchmarks.record [--kills 100] [--first 0] [--cost-s 120]``.
+"""What recording costs, what a kill leaves: ``python -m benchmarks.record [--kills 100] [--first 0] [--cost-s 120]``.
 
 Cost: an event loop ticks at 50 Hz as the daemon does; every ten seconds the recorder is given its ticks or not, in the
 same run. Beside processor time of the whole process, the lateness of the ticks is compared. Kills: a process records at
