@@ -213,7 +213,7 @@ def forecast_of(told: list[dict[str, Any]], config: Config) -> dict[str, Any]:
     def measured(kind: str) -> float | None:
         known = [f for f in told if f["kind"] == kind and (f["duration_s"] or 0.0) > 10.0][-5:]
         hours = sum(f["duration_s"] for f in known) / 3600.0
-        return sum(f["size_mb"] * int(f["every_n"]) for f in known) / hours if known else None
+        return sum(f["size_mb"] * _every_n(f) for f in known) / hours if known else None
 
     camera, own = config.camera, config.recording
     a_run, raw = measured("run"), measured("frames")
@@ -228,6 +228,12 @@ def forecast_of(told: list[dict[str, Any]], config: Config) -> dict[str, Any]:
         "raw_mb_per_hour": (color_n + depth_n) * camera.rate_hz * 3600.0 / 1e6 if raw is None else raw,
         "raw_from": "estimated" if raw is None else "as recorded last",
     }
+
+
+def _every_n(told: dict[str, Any]) -> int:
+    """One frame of how many was kept; whatever a stranger's file says."""
+    every_n = str(told["every_n"])
+    return int(every_n) if every_n.isascii() and every_n.isdigit() and len(every_n) < 7 else 1
 
 
 def _to_prune(entries: list[Entry], keep_mb: float | None, older_days: float | None, incidents: bool) -> list[Entry]:

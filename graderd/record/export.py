@@ -12,7 +12,7 @@ from graderd.perception.frame_set import Entry, FrameSetWriter, with_lens_of
 from graderd.record.files import RecordingFile
 from graderd.record.frames import Judged, judged_of
 from graderd.record.layout import COLOR, DEPTH, FRAME, LOG, PREVIEW, WIRE, Message
-from graderd.record.reader import Recording, said
+from graderd.record.reader import Recording, as_written, new_folder, said
 from graderd.record.table import rows, write_csv
 
 WHOLE = "recording.mcap"
@@ -26,31 +26,35 @@ def export(recording: Recording, folder: Path) -> dict[str, int]:
 
     Raises:
         FileExistsError: the folder is there already.
+        OSError: it cannot be written; nothing of it is left.
+        ProtocolError: the recording holds what graderd does not write.
     """
-    folder.mkdir(parents=True)
-    (folder / "config.json").write_bytes(recording.config_json)
-    found = {"ticks_n": write_csv(folder / "ticks.csv", rows(recording)), "pictures_n": 0, "log_lines_n": 0}
-    whole = RecordingFile(folder / WHOLE, recording.head, recording.config_json)
-    with ExitStack() as stack:
-        texts: dict[str, TextIO] = {}
-        for message in recording.messages():
-            whole.add(message)
-            if message.topic == PREVIEW:
-                picture = base64.b64decode(said(message)["data"])
-                path = folder / "pictures" / f"{message.log_ns}.jpg"
-                path.parent.mkdir(exist_ok=True)
-                path.write_bytes(picture)
-                found["pictures_n"] += 1
-            elif message.topic == LOG or message.topic.startswith(WIRE):
-                name = message.topic.rpartition("/")[2]
-                if name not in texts:
-                    texts[name] = stack.enter_context((folder / f"{name}.log").open("w", encoding="utf-8"))
-                lines = [_log_line(message)] if message.topic == LOG else said(message)["lines"]
-                texts[name].writelines(f"{line}\n" for line in lines)
-                found["log_lines_n"] += len(lines)
-    whole.finish()
-    if recording.frame_files:
-        found["frames_n"] = export_frames(recording, folder / "frames")
+    with new_folder(folder):
+        (folder / "config.json").write_bytes(recording.config_json)
+        found = {"ticks_n": write_csv(folder / "ticks.csv", rows(recording)), "pictures_n": 0, "log_lines_n": 0}
+        whole = RecordingFile(folder / WHOLE, recording.head, recording.config_json)
+        with ExitStack() as stack:
+            texts: dict[str, TextIO] = {}
+            for message in recording.messages():
+                whole.add(message)
+                if message.topic == PREVIEW:
+                    with as_written(recording, message):
+                        picture = base64.b64decode(said(message)["data"])
+                    path = folder / "pictures" / f"{message.log_ns}.jpg"
+                    path.parent.mkdir(exist_ok=True)
+                    path.write_bytes(picture)
+                    found["pictures_n"] += 1
+                elif message.topic == LOG or message.topic.startswith(WIRE):
+                    with as_written(recording, message):
+                        lines = [_log_line(message)] if message.topic == LOG else list(said(message)["lines"])
+                    name = message.topic.rpartition("/")[2]
+                    if name not in texts:
+                        texts[name] = stack.enter_context((folder / f"{name}.log").open("w", encoding="utf-8"))
+                    texts[name].writelines(f"{line}\n" for line in lines)
+                    found["log_lines_n"] += len(lines)
+        whole.finish()
+        if recording.frame_files:
+            found["frames_n"] = export_frames(recording, folder / "frames")
     return found
 
 

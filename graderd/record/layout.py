@@ -223,13 +223,16 @@ def tick_of(data: bytes) -> Tick:
         ValueError: it is no such message.
     """
     plain = _TICK.value_of(data)
-    plain["axes"] = MappingProxyType({name: AxisTick(**axis) for name, axis in plain["axes"].items()})
-    plain["faults"] = tuple(
-        ActiveFault(**fault | {"row": FaultRow(**fault["row"] | {"axes": frozenset(fault["row"]["axes"])})})
-        for fault in plain["faults"]
-    )
-    plain["readiness"] = tuple(Requirement(**requirement) for requirement in plain["readiness"])
-    return Tick(**plain)
+    try:
+        plain["axes"] = MappingProxyType({name: AxisTick(**axis) for name, axis in plain["axes"].items()})
+        plain["faults"] = tuple(
+            ActiveFault(**fault | {"row": FaultRow(**fault["row"] | {"axes": frozenset(fault["row"]["axes"])})})
+            for fault in plain["faults"]
+        )
+        plain["readiness"] = tuple(Requirement(**requirement) for requirement in plain["readiness"])
+        return Tick(**plain)
+    except (LookupError, TypeError, AttributeError) as error:
+        raise ValueError(f"no tick: {error}") from None
 
 
 @lru_cache(maxsize=64)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -127,7 +129,9 @@ class Recording:
                 if isinstance(inner, Channel):
                     names[inner.id] = inner.topic
                 elif isinstance(inner, McapMessage):
-                    topic = names[inner.channel_id]
+                    topic = names.get(inner.channel_id)
+                    if topic is None:  # a channel that nobody named: whoever wrote this, it is no message of ours
+                        continue
                     if (topics is None or topic in topics) and inner.log_time >= from_ns:
                         yield Message(topic, inner.log_time, inner.data)
 
@@ -156,3 +160,38 @@ def said(message: Message) -> dict[str, Any]:
     """A message's JSON."""
     found: dict[str, Any] = json.loads(message.data)
     return found
+
+
+@contextmanager
+def as_written(recording: Recording, message: Message) -> Iterator[None]:
+    """What is read from a message within: graderd writes it so, whoever else wrote the file may not.
+
+    Raises:
+        ProtocolError: something was not there, or of another kind; says of which message.
+    """
+    try:
+        yield
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
+        what = " ".join(str(error).split())[:120]
+        cause = f"{message.topic} at {message.log_ns / 1e9:.3f} s is not as graderd writes it ({what})"
+        remedy = "It is another version's, or another program's; the version in its head reads its own"
+        raise ProtocolError(str(recording.path), cause, remedy) from None
+
+
+@contextmanager
+def new_folder(folder: Path) -> Iterator[None]:
+    """A folder that is made and filled within; what fails takes it away again, so that a second try finds it free.
+
+    Raises:
+        FileExistsError: it is there already.
+        OSError: it cannot be made or filled; names it.
+    """
+    folder.mkdir(parents=True)
+    try:
+        yield
+    except OSError as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise OSError(error.errno, error.strerror or str(error), str(folder)) from None
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise

@@ -337,7 +337,7 @@ class _Files:
             reason = f"mark: {item.text}" if isinstance(item, Mark) and item.kind == "note" else ""
         if reason:
             messages = [*messages, self._translator.mark(Mark(kind="incident", text=reason))]
-        self._ring.put(messages, begins=isinstance(item, Memory))
+        self._ring.put(messages, begins_s=item.now_s if isinstance(item, Memory) else None)
         for file in (self._run, self._box):
             if file is not None:
                 for message in messages:
@@ -383,8 +383,11 @@ class _Files:
             self._begin_run(self._ring.newest())
 
     def _next_part(self) -> None:
-        """At a memory, where a replay can begin, a run that has grown large goes on in another file."""
-        if self._run is not None and self._run_size_n(self._run) >= self.store.part_most_bytes:
+        """At a memory, where a replay can begin, a run that has grown large goes on in another file; and where the wall
+        clock was set, so that within one file time does not jump."""
+        if self._run is not None and (
+            self._translator.clock_was_set or self._run_size_n(self._run) >= self.store.part_most_bytes
+        ):
             self._end_run()
             self._begin_run(iter(()))
 
@@ -499,10 +502,13 @@ def head_of(config: Config) -> dict[str, str]:
 
 
 class Ring:
-    """The messages of the last :data:`BEFORE_S` and a little more, in stretches that begin with a memory."""
+    """The messages of the last :data:`BEFORE_S` and a little more, in stretches that begin with a memory.
+
+    Its time is the monotonic one: where the wall clock is set, it neither grows nor forgets.
+    """
 
     def __init__(self) -> None:
-        self._stretches: deque[list[Message]] = deque()
+        self._stretches: deque[tuple[float, list[Message]]] = deque()
         self._has_memory = False
 
     @property
@@ -510,25 +516,25 @@ class Ring:
         """Whether there is anything."""
         return bool(self._stretches)
 
-    def put(self, messages: list[Message], *, begins: bool) -> None:
-        """Append. What came before the first memory stands before it in the first stretch."""
+    def put(self, messages: list[Message], begins_s: float | None = None) -> None:
+        """Append; ``begins_s``: when a memory, with which a stretch begins, was. What came before the first memory
+        stands before it in the first stretch."""
         if not self._stretches:
-            self._stretches.append([])
-        elif begins and self._has_memory:
-            self._stretches.append([])
-            oldest_ns = messages[0].log_ns - int(BEFORE_S * 1e9)
-            while len(self._stretches) > 2 and self._stretches[1][0].log_ns <= oldest_ns:
+            self._stretches.append((-math.inf if begins_s is None else begins_s, []))
+        elif begins_s is not None and self._has_memory:
+            self._stretches.append((begins_s, []))
+            while len(self._stretches) > 2 and self._stretches[1][0] <= begins_s - BEFORE_S:
                 self._stretches.popleft()
-        self._has_memory = self._has_memory or begins
-        self._stretches[-1] += messages
+        self._has_memory = self._has_memory or begins_s is not None
+        self._stretches[-1][1].extend(messages)
 
     def newest(self) -> Iterator[Message]:
         """From the last memory on."""
-        return iter(self._stretches[-1])
+        return iter(self._stretches[-1][1])
 
     def everything(self) -> Iterator[Message]:
         """All that is held."""
-        return (message for stretch in self._stretches for message in stretch)
+        return (message for _, stretch in self._stretches for message in stretch)
 
 
 class Translator:
@@ -536,6 +542,8 @@ class Translator:
 
     def __init__(self) -> None:
         self.now_s = 0.0
+        self.clock_was_set = False
+        """With the last memory: what comes from it on has another wall clock than what was before."""
         self._offset_ns = time.time_ns() - time.monotonic_ns()
         self._mode: Mode | None = None
         self._faults: frozenset[str] = frozenset()
@@ -547,7 +555,8 @@ class Translator:
             return list(self._step(item))
         if isinstance(item, Memory):
             offset_ns = time.time_ns() - time.monotonic_ns()
-            if abs(offset_ns - self._offset_ns) > 1e9:  # the wall clock was set
+            self.clock_was_set = abs(offset_ns - self._offset_ns) > 1e9
+            if self.clock_was_set:
                 self._offset_ns = offset_ns
             return [Message(MEMORY, self._at_ns(item.now_s), item.model_dump_json().encode())]
         if isinstance(item, Mark):

@@ -7,6 +7,7 @@ it is a what-if, as far as one can be: what was recorded does not answer to what
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -35,7 +36,7 @@ from graderd.record.layout import (
     tick_bytes,
     tick_of,
 )
-from graderd.record.reader import Recording
+from graderd.record.reader import Recording, as_written, said
 
 WARM_UP_S: Final = 10.0
 """Where the tick's memory is another version's, it is made anew from the state recorded, and not judged for so long:
@@ -160,12 +161,15 @@ def _decide(
         if message.topic == SENSED:
             knew = message.data
         elif message.topic == MARK:
-            if Mark.model_validate_json(message.data).kind == "lost":
+            with as_written(recording, message):
+                mark = Mark.model_validate_json(message.data)
+            if mark.kind == "lost":
                 controller = None
         elif message.topic == MEMORY:
             if controller is not None and not follows:
                 continue
-            memory = Memory.model_validate_json(message.data)
+            with as_written(recording, message):
+                memory = Memory.model_validate_json(message.data)
             try:
                 controller = controller_of(memory.controller, settings)
             except ValueError:
@@ -174,11 +178,14 @@ def _decide(
             found.skipped_n += 1
             if cold:  # the state of this tick is all there is to begin with
                 controller, cold = Controller(settings, _state(message.data)), False
-                warm_until_s = float(json.loads(message.data)["now_s"]) + WARM_UP_S
+                with as_written(recording, message):
+                    warm_until_s = float(said(message)["now_s"]) + WARM_UP_S
                 found.warm_ups_n += 1
         else:
             try:
                 sensed = sensed_of(knew)
+                if not math.isfinite(sensed.now_s):
+                    raise ValueError(f"it was at {sensed.now_s} s")
             except ValueError as error:
                 cause = f"what the tick knew is of another version ({str(error).splitlines()[0]})"
                 raise ProtocolError(str(recording.path), cause, "Replay it with the version in its head") from None
@@ -189,7 +196,8 @@ def _decide(
                 continue
             found.ticks_n += 1
             if told != message.data:
-                some = _differences(json.loads(message.data), json.loads(told), message.log_ns)
+                with as_written(recording, message):
+                    some = list(_differences(said(message), json.loads(told), message.log_ns))
                 # Counters and ages began anew where the memory did.
                 yield from (each for each in some if not (found.warm_ups_n and each.kind == "other"))
 

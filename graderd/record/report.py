@@ -16,8 +16,8 @@ import numpy as np
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import catalogue_key
 from graderd.record.export import raw_frames
-from graderd.record.layout import MARK, PREVIEW
-from graderd.record.reader import Recording, said
+from graderd.record.layout import MARK, PREVIEW, Mark
+from graderd.record.reader import Recording, as_written, new_folder, said
 from graderd.record.table import Row, rows, write_csv
 
 PICTURE_WITHIN_S: Final = 2.0
@@ -168,18 +168,20 @@ def write(recording: Recording, folder: Path) -> Story:
 
     Raises:
         FileExistsError: the folder is there already.
+        OSError: it cannot be written; nothing of it is left.
+        ProtocolError: the recording holds what graderd does not write.
     """
-    folder.mkdir(parents=True)
-    story, told = tell(recording)
-    write_csv(folder / "ticks.csv", told)
-    _add_pictures(recording, story)
-    _table_csv(folder / "decisions.csv", _DECISION_COLUMNS, map(_decision_cells, story.decisions))
-    _table_csv(
-        folder / "faults.csv",
-        ("wall_time", "fault", "from_s", "lasted_s"),
-        ((s.wall_time, s.name, f"{s.from_s:.3f}", f"{s.to_s - s.from_s:.3f}") for s in story.faults),
-    )
-    (folder / "index.html").write_text(page(recording, story), encoding="utf-8")
+    with new_folder(folder):
+        story, told = tell(recording)
+        write_csv(folder / "ticks.csv", told)
+        _add_pictures(recording, story)
+        _table_csv(folder / "decisions.csv", _DECISION_COLUMNS, map(_decision_cells, story.decisions))
+        _table_csv(
+            folder / "faults.csv",
+            ("wall_time", "fault", "from_s", "lasted_s"),
+            ((s.wall_time, s.name, f"{s.from_s:.3f}", f"{s.to_s - s.from_s:.3f}") for s in story.faults),
+        )
+        (folder / "index.html").write_text(page(recording, story), encoding="utf-8")
     return story
 
 
@@ -190,14 +192,16 @@ def _add_pictures(recording: Recording, story: Story) -> None:
     for message in recording.messages((PREVIEW, MARK)):
         at_s = (message.log_ns - first_ns) / 1e9
         if message.topic == MARK:
-            mark = said(message)
-            text = " ".join(filter(None, (mark["kind"], mark.get("text", ""), mark.get("client", ""))))
-            story.notes.append(Span(mark["kind"], at_s, at_s, text))
+            with as_written(recording, message):
+                mark = Mark.model_validate_json(message.data)
+            text = " ".join(filter(None, (mark.kind, mark.text, mark.client)))
+            story.notes.append(Span(mark.kind, at_s, at_s, text))
             continue
         for number, decision in enumerate(story.decisions):
             apart_s = abs(at_s - decision.at_s)
             if apart_s <= min(PICTURE_WITHIN_S, nearest.get(number, PICTURE_WITHIN_S)):
-                nearest[number], decision.picture = apart_s, said(message)["data"]
+                with as_written(recording, message):
+                    nearest[number], decision.picture = apart_s, said(message)["data"]
     nearest.clear()
     for judged in raw_frames(recording):
         depth = judged.frame.depth_mm

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from graderd.core.axes import AXES, UNITS
 from graderd.record.layout import SENSED, TICK
-from graderd.record.reader import Recording, said
+from graderd.record.reader import Recording, as_written, said
 
 Row = Mapping[str, Any]
 AXIS_COLUMNS: Final = tuple(
@@ -34,15 +34,22 @@ COLUMNS: Final = (
 
 
 def rows(recording: Recording) -> Iterator[Row]:
-    """Every tick, oldest first; what was not known is absent."""
+    """Every tick, oldest first; what was not known is absent.
+
+    Raises:
+        ProtocolError: a message is not as graderd writes it.
+    """
     sensed: dict[str, Any] = {}
     for message in recording.messages((SENSED, TICK)):
-        if message.topic == SENSED:
-            sensed = said(message)
-            continue
-        tick = said(message)
-        if sensed.get("now_s") == tick.get("now_s"):
-            yield _row(message.log_ns, sensed, tick)
+        row = None
+        with as_written(recording, message):
+            told = said(message)
+            if message.topic == SENSED:
+                sensed = told
+            elif sensed.get("now_s") == told.get("now_s"):
+                row = _row(message.log_ns, sensed, told)
+        if row is not None:
+            yield row
 
 
 def _row(log_ns: int, sensed: dict[str, Any], tick: dict[str, Any]) -> Row:

@@ -311,7 +311,7 @@ def test_a_killed_recorder_loses_a_second_at_most(tmp_path: Path) -> None:
 async def test_a_starved_thread_keeps_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each rest takes as long as others leave it waiting: 0.3 ms become 50."""
     rest = time.sleep
-    monkeypatch.setattr(recorder_module.time, "sleep", lambda seconds: rest(seconds + 0.05))
+    monkeypatch.setattr(time, "sleep", lambda seconds: rest(seconds + 0.05))
     feed = Feed(tmp_path)
     task = asyncio.create_task(feed.recorder.run())
     await feed.ticks(3.0)
@@ -478,6 +478,37 @@ def test_a_daemon_that_starts_stopped_is_no_incident(tmp_path: Path) -> None:
     work = Work(tmp_path)
     work.stand(5.0, Mode.STOPPED)
     assert work.paths("incident") == []
+
+
+@pytest.mark.parametrize("by_s", [3600, -3600])
+def test_a_clock_that_is_set_neither_fills_the_ring_nor_empties_it_nor_jumps_in_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by_s: int
+) -> None:
+    work = Work(tmp_path)
+    work.stand(60.0)
+    clock = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: clock() + by_s * 10**9)
+    work.stand(45.0)
+    for path in work.paths("run"):
+        assert Recording(path).extent.duration_s < 80.0
+    assert len(work.paths("run")) == 2
+    work.recorder.mark("now")
+    work.stand(AFTER_S + 1.0)
+    (incident,) = work.paths("incident")
+    from_s, to_s = spans_s(incident)
+    assert BEFORE_S + AFTER_S <= to_s - from_s <= BEFORE_S + AFTER_S + 12.0
+
+
+def test_two_daemons_may_record_into_one_folder(tmp_path: Path) -> None:
+    both = [Work(tmp_path), Work(tmp_path)]
+    for tick, sensed in zip(TICKS[:60], WORK[:60], strict=True):
+        for work in both:
+            work.ticks([tick], [sensed])
+    for work in both:
+        work.files._guarded(work.files._end)
+    paths = both[0].paths("run")
+    assert len(paths) == 2
+    assert [len(list(Recording(path).messages((TICK,)))) for path in paths] == [60, 60]
 
 
 def test_incidents_go_last(tmp_path: Path) -> None:
