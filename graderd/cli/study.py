@@ -158,8 +158,12 @@ def register(app: typer.Typer) -> None:
         else:
             print_text(f"wrote {page}, of {piles_n} piles")
 
-    @group.command(epilog=example("graderd study rule", "graderd study rule --save rule.toml"))
+    @group.command(epilog=example("graderd study rule", "graderd study rule my-blade.toml --save rule.toml"))
     def rule(
+        case: Annotated[
+            Path | None,
+            typer.Argument(metavar="CASE", help="A case file with the machine, soil and speed; default: most runs."),
+        ] = None,
         store: Where = STORE,
         save: Annotated[Path | None, typer.Option(metavar="FILE", help="Write it here instead of printing it.")] = None,
         json: Json = False,
@@ -170,9 +174,10 @@ def register(app: typer.Typer) -> None:
         """
         with _told():
             from graderd.studies.blade_rotation import rule as derived
+            from graderd.studies.blade_rotation.cases import load
             from graderd.studies.blade_rotation.store import Store
 
-            found = derived.derive(Store(store).results())
+            found = derived.derive(Store(store).results(), load(case) if case else None)
         if save is not None:
             save.write_text(found.toml(), encoding="utf-8")
         if json:

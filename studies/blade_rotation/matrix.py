@@ -48,7 +48,7 @@ class Size:
     few_seeds_n: int
 
 
-QUICK = Size(scattered_n=1500, layer_n=3000, seeds_n=5, few_seeds_n=3)
+QUICK = Size(scattered_n=1200, layer_n=2500, seeds_n=5, few_seeds_n=3)
 FULL = Size(
     scattered_n=named.SCATTERED.study_grains_n, layer_n=named.LAYER_ACROSS.study_grains_n, seeds_n=5, few_seeds_n=3
 )
