@@ -215,7 +215,8 @@ class SoilClassifier:
         if judge is None or frame.depth_mm is None:
             return _Judged(Verdict(Zone.UNKNOWN, 0.0, "no calibration of the depth picture applies")), []
         soil = judge.height_map(frame.depth_mm, stance)
-        by_depth, ahead = judge.verdict(soil), judge.verdict_ahead(soil)
+        by_depth = judge.verdict(soil)
+        ahead = judge.verdict_ahead(soil, by_depth)
         faults = self._seen(soil, stance)
         if region is None or settings.method == "depth" or faults:
             return _Judged(by_depth, ahead, soil.carried_l), faults

@@ -203,10 +203,16 @@ class DepthJudge:
         """Judge a height map."""
         return self._believed(soil, soil.volumes_l, soil.doubtful_l)
 
-    def verdict_ahead(self, soil: HeightMap) -> Verdict:
-        """Judge what the blade will meet."""
+    def verdict_ahead(self, soil: HeightMap, whole: Verdict) -> Verdict:
+        """Judge what the blade will meet; ``whole``: the verdict on all that lies before it.
+
+        What is met lies a little further ahead too, where a plank on the ground is no more than its near edge: where
+        there is no soil before the blade yet, that alone turns nothing.
+        """
         verdict = self._believed(soil, soil.ahead_l, soil.doubtful_ahead_l)
         ahead_l, carried_l = sum(soil.ahead_l), sum(soil.carried_l)
+        if verdict.zone is not Zone.NONE and whole.zone is Zone.NONE:
+            return verdict.unknown(f"{ahead_l:.1f} l lie ahead, and too little of it before the blade to tell soil by")
         if verdict.zone is not Zone.NONE and ahead_l * 100 < self._settings.ahead_min_percent * carried_l:
             return verdict.unknown(f"{ahead_l:.1f} l ahead do not stand out of the {carried_l:.1f} l that are carried")
         if abs(soil.angle_deg) > STEEPEST_MEETING_DEG:

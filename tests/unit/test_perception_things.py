@@ -16,9 +16,14 @@ from graderd.perception.classifier import make_classifier
 from graderd.perception.forms import fill_hidden, standing, steep_cells
 from graderd.perception.geometry import F32, F64
 from graderd.perception.settings import FormSettings
+from graderd.simulator.camera.appearance import Appearance
+from graderd.simulator.camera.ground import SceneState
 from graderd.simulator.camera.renderer import Renderer
+from graderd.simulator.camera.shapes import Solid
+from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.piles import SceneZone
-from harness.perception_things import COLOR_SIZE, DEPTH_SIZE, SIDES, photograph
+from graderd.simulator.grader.soil import SoilField
+from harness.perception_things import COLOR_SIZE, DEPTH_SIZE, SIDES, VEHICLE_X_M, photograph
 
 ON_GROUND = MeasuredAttitude(2.0, 0.0, 0.0)
 
@@ -60,6 +65,20 @@ def test_what_lies_there_and_is_no_soil_does_not_count(kind: str, side: Zone) ->
         assert judged(empty, angle_deg).zone in (Zone.NONE, Zone.UNKNOWN)
         loaded = photograph(renderer(), kind, side, opposite, angle_deg, number)
         assert judged(loaded, angle_deg).zone in (Zone(str(opposite)), Zone.UNKNOWN)
+
+
+@pytest.mark.parametrize(("s_m", "half_long_m"), [(0.0, 0.5), (0.33, 0.2), (-0.33, 0.2)])
+def test_a_plank_beyond_the_soils_zone_turns_no_blade(s_m: float, half_long_m: float) -> None:
+    """Flat on the ground it has no form that is not soil's; before the blade lay no pile, ahead of it was one."""
+    plank = Solid("box", (0.49, s_m, 0.03), (0.10, half_long_m, 0.03), (150, 120, 80), 0.0)
+    field = SoilField()
+    state = SceneState(field.heights_m.astype(np.float32), field.cell_m, VEHICLE_X_M, BladePose(0.0), (plank,))
+    color, depth = renderer().render(state, Appearance(ground="earth", disparity_noise_px=0.1))
+    frame = Frame(color, depth, renderer().color_intrinsics, renderer().depth_intrinsics, 0.0)
+    observation = judged(frame, 0.0)
+    assert observation.zone is Zone.NONE
+    assert observation.ahead is not None
+    assert observation.ahead.zone in (Zone.NONE, Zone.UNKNOWN)
 
 
 def test_a_colour_method_sees_who_stands_there_too() -> None:
