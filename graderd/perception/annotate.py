@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,7 +28,10 @@ Bgr = tuple[int, int, int]
 COLORS: dict[int, Bgr] = {LEFT: (80, 200, 80), CENTER: (230, 170, 60), RIGHT: (60, 120, 240)}
 NAMES = {LEFT: "LEFT", CENTER: "CENTER", RIGHT: "RIGHT"}
 ZONES = {LEFT: Zone.LEFT, CENTER: Zone.CENTER, RIGHT: Zone.RIGHT}
-FONT = cv2.FONT_HERSHEY_SIMPLEX
+FONT: Any = cv2.FontFace("sans")
+"""OpenCV's own (Rubik, in its library), with the degree sign and other scripts."""
+TALL_PX, LEAST_PX, WEIGHT = 30.0, 15, 500
+"""Bolder, or smaller, letters run together; lighter ones fall apart."""
 WHITE: Bgr = (255, 255, 255)
 DARK: Bgr = (30, 30, 30)
 
@@ -98,32 +102,44 @@ def _label(picture: U8, outline: F64, third: int, observation: SoilObservation, 
     middle = np.clip(outline, (0, 0), (picture.shape[1] - 1, picture.shape[0] - 1)).mean(axis=0)
     for row, text in enumerate((NAMES[third], below)):
         size = scale * (0.9 if row == 0 else 0.7)
-        (w, h), _ = cv2.getTextSize(text, FONT, size, 2)
+        w, h = _extent(text, size)
         at = (int(middle[0] - w / 2), int(middle[1] + row * (h + 14 * scale)))
-        text_on(picture, text, at, size, COLORS[third])
+        text_on(picture, text, at, size, COLORS[third] if row == 0 else WHITE)
 
 
 def text_on(picture: U8, text: str, at: tuple[int, int], size: float, color: Bgr = WHITE) -> None:
-    """Text with a dark rim, readable on any ground."""
-    thick, rim = max(1, round(2 * size)), max(1, round(1.6 * size))
-    # The same strokes shifted round: a thicker stroke would be a wider font.
+    """Text with a dark rim, readable on any ground. ``at``: where its base line begins; ``size``: of `TALL_PX`."""
+    tall_px = _tall_px(size)
+    rim = max(1, round(tall_px / 16))
     for dx, dy in ((-rim, 0), (rim, 0), (0, -rim), (0, rim), (-rim, rim), (rim, rim), (-rim, -rim), (rim, -rim)):
-        cv2.putText(picture, text, (at[0] + dx, at[1] + dy), FONT, size, DARK, thick, cv2.LINE_AA)
-    cv2.putText(picture, text, at, FONT, size, color, thick, cv2.LINE_AA)
+        cv2.putText(picture, text, (at[0] + dx, at[1] + dy), DARK, FONT, tall_px, WEIGHT)
+    cv2.putText(picture, text, at, color, FONT, tall_px, WEIGHT)
+
+
+def _tall_px(size: float) -> int:
+    return max(LEAST_PX, round(TALL_PX * size))
+
+
+def _extent(text: str, size: float) -> tuple[int, int]:
+    """Width and height, in pixels."""
+    _, _, width, height = cv2.getTextSize((0, 0), text, (0, 0), FONT, _tall_px(size), WEIGHT)
+    return width, height
 
 
 def _banner(picture: U8, observation: SoilObservation, scale: float) -> None:
-    tall = round(74 * scale)
+    tall, margin, width = max(36, round(74 * scale)), round(14 * scale), picture.shape[1]
     picture[:tall] = (picture[:tall] * 0.35).astype(np.uint8)
+    first, second = round(0.46 * tall), round(0.88 * tall)
     head = f"{observation.zone.upper()}  {observation.confidence * 100:.0f} %"
     color = WHITE if observation.zone is not Zone.UNKNOWN else (80, 160, 255)
-    text_on(picture, head, (round(14 * scale), round(34 * scale)), 1.0 * scale, color)
-    tail = f"{observation.method}  blade {observation.blade_angle_deg:+.1f} deg  {observation.cpu_ms:.1f} ms"
-    (w, _), _ = cv2.getTextSize(tail, FONT, 0.7 * scale, 2)
-    text_on(picture, tail, (picture.shape[1] - w - round(14 * scale), round(32 * scale)), 0.7 * scale)
-    reason = observation.reason.replace("°", " deg").encode("ascii", "replace").decode()
-    most = int(picture.shape[1] / (9.8 * scale))
-    text_on(picture, reason[:most], (round(14 * scale), round(62 * scale)), 0.5 * scale)
+    text_on(picture, head, (margin, first), 1.0 * scale, color)
+    tail = f"{observation.method}  blade {observation.blade_angle_deg:+.1f}°  {observation.cpu_ms:.1f} ms"
+    tail_px = _extent(tail, 0.7 * scale)[0]
+    if _extent(head, 1.0 * scale)[0] + tail_px + 4 * margin < width:
+        text_on(picture, tail, (width - tail_px - margin, first), 0.7 * scale)
+    wide = _extent(observation.reason, 0.6 * scale)[0]
+    most = int(len(observation.reason) * min(1.0, (width - 2 * margin) / max(wide, 1)))
+    text_on(picture, observation.reason[:most], (margin, second), 0.6 * scale)
 
 
 def calibration_picture(color_bgr: U8, result: CalibrationResult, angle_deg: float) -> U8:
@@ -138,14 +154,14 @@ def calibration_picture(color_bgr: U8, result: CalibrationResult, angle_deg: flo
         if np.isfinite(outline).all():
             cv2.polylines(picture, [np.round(outline).astype(np.int32)], True, COLORS[third], line, cv2.LINE_AA)
             middle = outline[[0, 1, 4, 5]].mean(axis=0)
-            (w, h), _ = cv2.getTextSize(NAMES[third], cv2.FONT_HERSHEY_SIMPLEX, scale, 2)
+            w, h = _extent(NAMES[third], scale)
             text_on(picture, NAMES[third], (int(middle[0] - w / 2), int(middle[1] + h / 2)), scale, COLORS[third])
     outline = view.project(face_outline_m(result, angle_deg))
     if np.isfinite(outline).all():
         cv2.polylines(picture, [np.round(outline).astype(np.int32)], True, WHITE, line, cv2.LINE_AA)
     fits = [f"{result.residual_mm:.1f} mm"] if result.residual_mm is not None else []
     fits += [f"{result.residual_px:.2f} px"] if result.residual_px is not None else []
-    text = f"blade {angle_deg:+.1f} deg   fits to {' and '.join(fits) or 'nothing'}   left and right: operator's"
+    text = f"blade {angle_deg:+.1f}°   fits to {' and '.join(fits) or 'nothing'}   left and right: operator's"
     text_on(picture, text, (round(14 * scale), round(34 * scale)), 0.8 * scale)
     return picture
 
