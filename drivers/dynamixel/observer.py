@@ -140,9 +140,12 @@ class ServoObserver:
         return counts if extended else (counts + turn // 2) % turn - turn // 2
 
     async def read_health(self, device: Ph54Device, *, attempts_n: int = 1) -> None:
-        """Torque and hardware error."""
+        """Torque and hardware error. Torque that is otherwise than before is read twice: one wrong reading would leave
+        a blade that turns to itself, since nothing is owed to what is not powered."""
         self.health_s = now_s = self._clock.now_s()
         health, _ = await device.read_block(device.health_block, attempts_n=attempts_n)
+        if bool(health["torque_enable"]) is not self.torque_on:
+            health, _ = await device.read_block(device.health_block, attempts_n=attempts_n)
         bits = health["hardware_error_status"]
         present = {
             name: f"hardware error bit 0x{bit:02X} is set (status 0x{bits:02X}); cleared by a reboot of the servo only"
@@ -165,9 +168,12 @@ class ServoObserver:
         self.faults.set("turns_lost", detail, now_s)
 
     async def read_goals(self, device: Ph54Device, *, attempts_n: int = 1) -> dict[str, int]:
-        """Watchdog, profile and goal registers; a trip is told once, however long the register stays tripped."""
+        """Watchdog, profile and goal registers; a trip is told once, however long the register stays tripped. It is
+        read twice as well: a servo that has tripped brakes by itself, and is sent no hold."""
         self.goals_s = now_s = self._clock.now_s()
         goals, _ = await device.read_block(device.goal_block, attempts_n=attempts_n)
+        if (goals["bus_watchdog"] == WATCHDOG_TRIPPED) is not self.tripped:
+            goals, _ = await device.read_block(device.goal_block, attempts_n=attempts_n)
         tripped = goals["bus_watchdog"] == WATCHDOG_TRIPPED
         if tripped and not self.tripped:
             self.faults.tell("watchdog_tripped", "the servo's bus watchdog has stopped it; arm again", now_s)

@@ -230,9 +230,9 @@ class Ph54Rotator:
             LifecycleError: active.
             DeviceMissingError: there is no port.
         """
-        if self._task.lifecycle is Lifecycle.ACTIVE:
-            raise LifecycleError(DEVICE, "cannot look for others while it is armed", "Disarm first")
+        self._require_not_active()
         async with self._task.wire_lock:
+            self._require_not_active()  # it may have been armed while this waited for the wire
             self._task.note(Event.LOST)
             return await self._link.scan()
 
@@ -245,6 +245,10 @@ class Ph54Rotator:
         if self.calibration.current_limit_a > most_a:
             cause = f"current_limit_a {self.calibration.current_limit_a:g} is above {most_a:g} A"
             raise CommandRangeError(f"settings of {DEVICE}", cause, f"Profile: {self.table.name}")
+
+    def _require_not_active(self) -> None:
+        if self._task.lifecycle is Lifecycle.ACTIVE:
+            raise LifecycleError(DEVICE, "cannot look for others while it is armed", "Disarm first")
 
     def _require(self, state: Lifecycle) -> None:
         if self._task.lifecycle is not state:

@@ -279,6 +279,13 @@ async def test_a_scan_finds_ids_and_baud_rates_and_the_servo_comes_back(tmp_path
         with pytest.raises(LifecycleError, match="armed"):
             await rotator.scan()
         await rotator.disarm()
+        arming = asyncio.create_task(rotator.arm())
+        await asyncio.sleep(0)  # it has the wire, and is not armed yet
+        with pytest.raises(LifecycleError, match="armed"):
+            await rotator.scan()
+        await arming
+        assert rotator.lifecycle is Lifecycle.ACTIVE
+        await rotator.disarm()
         found = await rotator.scan()
         assert [(f.baud_n, f.servo_id_n, f.model_n) for f in found] == [(57_600, 1, 2020), (57_600, 17, 2020)]
         await until(lambda: rotator.lifecycle is Lifecycle.STANDBY, "not found again")

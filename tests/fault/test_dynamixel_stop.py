@@ -184,6 +184,33 @@ async def test_a_wrong_position_in_the_very_reading_that_the_hold_asks_for(rig: 
     assert good(await stopped(rig, "50 ms late and one reading off"), 0.6)
 
 
+@pytest.mark.parametrize("held", [False, True], ids=["under way", "and a hold"])
+async def test_one_reading_that_says_torque_off(rig: Bench, monkeypatch: pytest.MonkeyPatch, held: bool) -> None:
+    """Believed, it would leave a blade that turns to itself: no hold is owed to what is not powered."""
+    await under_way(rig)
+    read, address, misread_n = rig.servo.read, rig.servo.table["torque_enable"].address, 0
+
+    def misread(first: int, size: int) -> tuple[int, bytes]:
+        nonlocal misread_n
+        error, data = read(first, size)
+        if misread_n or not first <= address < first + size:
+            return error, data
+        misread_n += 1
+        if held:
+            rig.rotator.hold()
+        return error, data[: address - first] + b"\0" + data[address - first + 1 :]
+
+    monkeypatch.setattr(rig.servo, "read", misread)
+    if held:
+        await rig.until(lambda: misread_n)
+        assert good(await stopped(rig, "one reading says torque off"))
+    else:
+        await rig.drive(100.0, rig.past(40.0))
+    assert misread_n
+    assert rig.rotator.lifecycle is Lifecycle.ACTIVE
+    assert not rig.conditions() & {"ram_reset", "torque_off"}
+
+
 async def test_a_hold_that_is_refused(rig: Bench) -> None:
     await under_way(rig)
     rig.bus.inject("refuse", address=556, error=6)  # the block of profile and goal
