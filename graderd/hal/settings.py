@@ -280,7 +280,7 @@ class StopInputSettings(Settings):
     gpio_sense_n: int = Field(1, ge=0, description="gpio: number of the line at the loop's end")
     gpio_pull_down: bool = Field(True, description="gpio: the chip pulls the input down; false: a resistor does")
     poll_hz: Positive = Field(100.0, ge=10, le=1000, description="looks at the loop a second")
-    open_samples_n: int = Field(2, ge=1, le=10, description="open in so many looks in a row: stop")
+    open_samples_n: int = Field(2, ge=1, le=10, description="open in so many looks: stop; three closed ones undo one")
     stale_s: Positive = Field(0.2, le=1.0, description="no look for so long: stop; a pressed button acts within that")
     test_every_s: NotNegative = Field(
         10.0,

@@ -35,6 +35,22 @@ class _Word:
     time_s: float
 
 
+class _Contact:
+    """What the looks at a loop say together. Closed looks count against open ones at a third, as time without a fault
+    does against it: a contact that shakes is open although it never is for long, and one disturbance is forgotten.
+    ``open``: from enough open looks until nothing speaks for it any more."""
+
+    def __init__(self, open_samples_n: int) -> None:
+        self.open = False
+        self._needed_thirds = 3 * open_samples_n
+        self._thirds = 0
+
+    def see(self, closed: bool) -> None:
+        """One more look."""
+        self._thirds = max(0, self._thirds - 1) if closed else min(self._needed_thirds, self._thirds + 3)
+        self.open = self._thirds == self._needed_thirds or (self.open and self._thirds > 0)
+
+
 class StopInputWatch:
     """One input, looked at ``poll_hz`` times a second. ``on_stop`` runs in the event loop, ahead of any tick."""
 
@@ -96,15 +112,15 @@ class StopInputWatch:
     def _read_loop(self, loop: asyncio.AbstractEventLoop) -> None:
         """Read, and now and then test, until told to end or until the port is lost."""
         settings = self._settings
-        opens_n, stuck = 0, False
+        contact, stuck = _Contact(settings.open_samples_n), False
         test_due_s = self._clock.now_s()
         while not self._ending.is_set():
             closed = self._source.is_closed()
             if closed and settings.test_every_s and self._clock.now_s() >= test_due_s:
                 stuck = not self._source.follows()
                 test_due_s = self._clock.now_s() + settings.test_every_s
-            opens_n = 0 if closed else opens_n + 1
-            if opens_n >= settings.open_samples_n:
+            contact.see(closed)
+            if contact.open:
                 self._say(loop, "open", f"{self._source.where}: the loop is open")
             elif closed and stuck:
                 self._say(loop, "stuck", f"{self._source.where}: reads closed though nothing drives the loop")

@@ -9,8 +9,10 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import gpiod
 import pytest
@@ -319,6 +321,39 @@ async def test_a_press_is_told_at_once_and_once_and_stands_until_released(tmp_pa
         assert len(w.stops) == 1
         await w.loop.become("closed")
         await w.permitted()
+
+
+@pytest.mark.parametrize(
+    ("looks", "found"),
+    [
+        ("CCOCCCCCOCCCCCCOCCCC", [""]),  # now and then one alone: a disturbance
+        ("CCCC" + "OC" * 10, ["", "open"]),  # a contact that shakes is no closed one
+        ("CCCC" + "OCC" * 10, ["", "open"]),
+        ("COO" + "CO" * 5 + "C" * 5 + "OC", ["", "open"]),  # and stays open while it does
+        ("COO" + "C" * 6, ["", "open", ""]),
+    ],
+)
+def test_a_loop_that_opens_again_and_again_is_open(
+    looks: str, found: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Shaking(SimulatedStopInput):
+        def is_closed(self) -> bool:
+            if len(left) == 1:
+                watch._ending.set()
+            return left.pop(0) == "C"
+
+    left, told = list(looks), list[str]()
+    settings = StopInputSettings(backend="simulated", poll_hz=1000.0, test_every_s=0.0)
+    watch = StopInputWatch(settings, Shaking("nowhere"), ManualClock(0.0), lambda _: None)
+    say = watch._say
+
+    def heard(loop: asyncio.AbstractEventLoop, condition: str, detail: str) -> None:
+        told.append(condition)
+        say(loop, condition, detail)
+
+    monkeypatch.setattr(watch, "_say", heard)
+    watch._read_loop(cast("Any", SimpleNamespace(call_soon_threadsafe=lambda call, *said: call(*said))))
+    assert [condition for condition, _ in groupby(told)] == found
 
 
 @pytest.mark.live
