@@ -205,7 +205,12 @@ def _lapse(state: State, now_s: float) -> State:
     """A lease that nobody renewed in time is over before any command is heard: a late one renews nothing."""
     if state.lease is None or now_s <= state.lease.expires_s:
         return state
-    return _manual(state, f"lease of {state.lease.client or 'the client'} lapsed")
+    return _manual(state, lapse_of(state.lease.client))
+
+
+def lapse_of(client: str) -> str:
+    """The reason of a machine whose client did not renew its lease in time."""
+    return f"lease of {client or 'the client'} lapsed"
 
 
 def _obey(state: State, command: cmd.Command, inputs: Inputs, settings: MachineSettings) -> tuple[State, cmd.Reply]:

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Self
 
 from graderd.core import commands as cmd
-from graderd.core.machine import Mode
+from graderd.core.machine import Mode, lapse_of
 from graderd.hal.errors import DeviceLostError, DeviceRefusedError
 from graderd.runtime.control import ControlLoop
 
@@ -62,7 +62,7 @@ class Maneuver:
 
         Raises:
             DeviceRefusedError: beyond a limit, or another client is moving the blade.
-            DeviceLostError: the machine left manual mode (stop, fault) under way.
+            DeviceLostError: the machine left manual mode (stop, fault) under way, or the rotation was held.
         """
         await self._jog(angle_deg)
         clock = asyncio.get_running_loop().time
@@ -73,6 +73,7 @@ class Maneuver:
             if clock() >= renew_s:
                 renew_s = clock() + RENEW_S
                 if not (await self._loop.command(cmd.Renew(client=CLIENT))).accepted:
+                    self._check_lapsed()
                     # A late renewal on a loaded machine: the blade held meanwhile; ask again.
                     await self._jog(angle_deg)
             if each is not None:
@@ -90,6 +91,12 @@ class Maneuver:
         except DeviceRefusedError:
             self._check_manual()  # a stop between two commands is why the second one is refused: tell the stop
             raise
+
+    def _check_lapsed(self) -> None:
+        """What ended otherwise than by our own lateness (a fault held the rotation) does not go on by itself."""
+        state = self._loop.tick.state
+        if state.reason != lapse_of(CLIENT):
+            raise DeviceLostError("maneuver", f"ended under way: {state.reason}")
 
     def _check_manual(self) -> None:
         state = self._loop.tick.state

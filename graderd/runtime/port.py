@@ -150,8 +150,10 @@ class Port:
             raise ServiceError(f"{name} may move or unpower the blade", "repeat with consent when the area is clear")
         if self._under_way:
             raise ServiceError(f"{self._under_way} is under way", "wait until it is done, or send stop")
-        if (mode := self._loop.tick.state.mode) is not Mode.DISARMED:
-            raise ServiceError(f"{name} needs a disarmed machine; it is {mode}", "disarm first")
+        state = self._loop.tick.state
+        if state.mode is not Mode.DISARMED or state.arming_since_s is not None:
+            what = state.mode if state.arming_since_s is None else "being armed"
+            raise ServiceError(f"{name} needs a disarmed machine; it is {what}", "disarm first")
         self._under_way = name
         try:
             return await _answer_of(service.run(wanted) if service.moves else _to_the_end(service.run(wanted)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ import pytest
 from graderd.api.port import ServiceError
 from graderd.config import Config
 from graderd.core import commands as cmd
-from graderd.core.machine import Mode
+from graderd.core.machine import Lease, Mode
 from graderd.hal.device import DeviceService, Lifecycle, NoArguments
 from graderd.hal.errors import DeviceLostError, DeviceRefusedError
+from graderd.hal.fault import DeviceFault
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.maneuver import Maneuver
 from graderd.runtime.port import Port
@@ -97,6 +99,51 @@ async def test_stop_ends_it_under_way(tmp_path: Path) -> None:
         assert loop.tick.state.mode is Mode.STOPPED
 
 
+@pytest.mark.parametrize("why", ["a fault", "no measurement"])
+@in_simulated_time
+async def test_what_was_held_under_way_does_not_go_on_by_itself(tmp_path: Path, why: str) -> None:
+    async with running(tmp_path) as (machine, loop):
+        held_s: list[float] = []
+
+        def hold_for_a_moment() -> None:
+            now_s = loop.tick.now_s
+            if machine.rotation.position > 2.0 and not held_s:
+                held_s.append(now_s)
+                if why == "a fault":
+                    machine.rotation.present.append(DeviceFault("daemon", "perception_nonsense", "", now_s))
+                else:
+                    machine.rotation.silent_since_s = now_s - 1.0
+            elif held_s and now_s > held_s[0] + 0.08:
+                machine.rotation.present.clear()
+                machine.rotation.silent_since_s = None
+
+        with pytest.raises(DeviceLostError, match="rotation was held"):
+            async with Maneuver(loop) as blade:
+                await blade.rotate_to(40.0, 30.0, hold_for_a_moment)
+        assert held_s
+        assert machine.rotation.position < 6.0
+        assert loop.tick.state.mode is Mode.DISARMED
+
+
+@in_simulated_time
+async def test_a_renewal_that_came_too_late_is_no_reason_to_end(tmp_path: Path) -> None:
+    async with running(tmp_path) as (machine, loop):
+        late: list[float] = []
+
+        def stand_still_once() -> None:
+            if machine.rotation.position > 2.0 and not late:
+                late.append(loop.tick.now_s)
+                loop.run_tick()
+                loop.controller._state = replace(
+                    loop.controller._state, lease=Lease("maneuver", loop.tick.now_s - 0.001)
+                )
+
+        async with Maneuver(loop) as blade:
+            await blade.rotate_to(10.0, 5.0, stand_still_once)
+        assert late
+        assert machine.rotation.position == pytest.approx(10.0, abs=0.1)
+
+
 @in_simulated_time
 async def test_it_refuses_what_an_operator_would_be_refused(tmp_path: Path) -> None:
     async with running(tmp_path) as (machine, loop):
@@ -168,6 +215,18 @@ async def test_one_at_a_time(tmp_path: Path) -> None:
         with pytest.raises(ServiceError):
             await first
         assert machine.rotation.position < 5.0
+
+
+@pytest.mark.parametrize("name", ["rotation.turn", "rotation.other"])
+@in_simulated_time
+async def test_a_machine_that_somebody_arms_is_not_his(tmp_path: Path, name: str) -> None:
+    """What may unpower a device, or takes the machine for itself, comes neither between a person's arm and its end."""
+    async with running(tmp_path) as (machine, loop):
+        assert (await loop.command(cmd.Arm(client="cab"))).accepted
+        assert loop.tick.state.arming_since_s is not None
+        with pytest.raises(ServiceError, match="being armed"):
+            await port_of(machine, loop).service(name, {"consent": True})
+        await until(lambda: loop.tick.state.mode is Mode.MANUAL)
 
 
 @pytest.mark.parametrize("consent", ["false", "no", [0], -1, 1, 1.0, None])

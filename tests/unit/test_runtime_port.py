@@ -9,7 +9,7 @@ import pytest
 
 from graderd.api.port import ServiceError
 from graderd.config import Config
-from graderd.core.machine import Mode
+from graderd.core.machine import Mode, State
 from graderd.hal.device import DeviceService
 from graderd.hal.errors import DeviceTimeoutError
 from graderd.runtime.port import Port
@@ -33,7 +33,7 @@ def port_in(mode: Mode, ran: list[str]) -> Port:
         "rotation.verify": service("verify", only_reads=True),
         "rotation.fails": DeviceService(fails, only_reads=True),
     }
-    loop = SimpleNamespace(tick=SimpleNamespace(state=SimpleNamespace(mode=mode)))
+    loop = SimpleNamespace(tick=SimpleNamespace(state=State(mode=mode)))
     return Port(Config(), cast("Any", loop), cast("Any", SimpleNamespace(buses={})), cast("Any", None), services)
 
 
