@@ -7,7 +7,7 @@ import contextlib
 import json
 import logging
 from collections.abc import AsyncGenerator, Coroutine
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from fastapi import APIRouter, Query, WebSocket
 from pydantic import BaseModel, TypeAdapter, ValidationError
@@ -20,7 +20,16 @@ from graderd.api.problem import Problem, ProblemError, answer, problem_of_valida
 from graderd.api.settings import ApiLimits
 from graderd.api.stop import StopLane, is_stop_command
 from graderd.api.tcp_guard import Grant
-from graderd.core.commands import AnyCommand, Command, Jog, Preset, Release, Reply
+from graderd.core.commands import (
+    STOP_CAME_FIRST,
+    STOP_REMEDY,
+    AnyCommand,
+    Command,
+    Jog,
+    Preset,
+    Release,
+    Reply,
+)
 from graderd.core.status import Status
 from graderd.hal.text import printable
 
@@ -28,9 +37,14 @@ COMMAND: TypeAdapter[Command] = TypeAdapter(AnyCommand)
 MALFORMED_PAUSE_S = 0.1
 POLICY = 1008
 """RFC 6455: the connection was closed because its other end may not have it."""
-TOO_LARGE = 1009
-"""RFC 6455: the connection was closed because of a message too large to be read."""
-TOO_LARGE_REASON = b'{"reason": "a message too large to be read"}'
+NEVER_READ = {
+    1007: b'{"reason": "a message that was no UTF-8"}',
+    1009: b'{"reason": "a message too large to be read"}',
+}
+"""RFC 6455: the connection was closed because of a message that could not be read. It may have been a stop."""
+WAITING_N = 1000
+"""Messages of one client that wait for their answers. One that sends more, and faster than it is obeyed, is let go: a
+stop of its own would come to nobody."""
 log = logging.getLogger(__name__)
 UPGRADE_ONLY: dict[int | str, dict[str, Any]] = {
     101: {"description": "the WebSocket is open"},
@@ -93,8 +107,9 @@ def socket_routes(
         client: Annotated[str, Query(max_length=60)] = "jog",  # noqa: ARG001  (for the description)
     ) -> Reply:
         """The client sends commands (`jog`, `preset`, `renew`, `release`, or any other), one a message, and gets for
-        each a `Reply` or a `Problem`, in order. The lease belongs to the connection: it is given back when the
-        connection ends for whatever reason, and lapses by itself 0.3 s after the last `renew`."""
+        each a `Reply` or a `Problem`, in order. A stop overtakes what was sent before it and was not obeyed yet: that
+        is void. Who has more than 1000 messages waiting is let go. The lease belongs to the connection: it is given
+        back when that ends for whatever reason, and lapses by itself 0.3 s after the last `renew`."""
         raise _upgrade_needed("jog")
 
     @router.get("/bus/{name}", tags=["status"], summary="WebSocket: a wire as it is", responses=UPGRADE_ONLY)
@@ -107,8 +122,20 @@ def socket_routes(
     return router
 
 
+class _Waiting(NamedTuple):
+    """A message that waits for its answer. ``stops_n``: how many stops of this client came before it; ``answer``: where
+    it was one itself."""
+
+    text: bytes
+    stops_n: int
+    answer: Reply | None = None
+
+
 class _JogSession:
-    """One client's connection: its commands carry a name nobody else has, so its lease is its own."""
+    """One client's connection: its commands carry a name nobody else has, so its lease is its own.
+
+    They are obeyed one after the other, and read ahead: a stop among them overtakes what waits, which it makes void.
+    """
 
     def __init__(self, port: DaemonPort, limits: ApiLimits, stops: StopLane, client: str, by: str) -> None:
         self._by = by
@@ -117,19 +144,47 @@ class _JogSession:
         self._stops = stops
         self._client = client
         self._moved = False
+        self._stops_n = 0
+        self._waiting: asyncio.Queue[_Waiting] = asyncio.Queue(WAITING_N)
 
     async def run(self, socket: WebSocket) -> None:
-        """Obey one message after the other until the client goes."""
+        """Obey one message after the other until the client goes; what waits then is nobody's any more."""
+        reading = asyncio.create_task(self._read(socket), name="api jog reads")
+        obeying = asyncio.create_task(self._obey_all(socket), name="api jog obeys")
+        try:
+            done, _ = await asyncio.wait((reading, obeying), return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in (reading, obeying):
+                task.cancel()
+            await asyncio.gather(reading, obeying, return_exceptions=True)
+
+    async def _obey_all(self, socket: WebSocket) -> None:
+        while True:
+            answer = await self._answer(await self._waiting.get())
+            await socket.send_text(answer.model_dump_json())
+            await asyncio.sleep(0)  # answers that are ready must not keep the tick waiting for the last of them
+
+    async def _read(self, socket: WebSocket) -> None:
+        """Read until the client goes, and carry stops out as they come."""
         while True:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
-                if message.get("code") == TOO_LARGE:
-                    # Never read, it may have been a stop.
-                    await self._stops.carry_out(TOO_LARGE_REASON, self._client, self._by)
+                if (reason := NEVER_READ.get(message.get("code", 0))) is not None:
+                    await self._stops.carry_out(reason, self._client, self._by)
                 return
             text = message.get("text")
-            answer = await self._answer(text.encode("utf-8", "replace") if text else message.get("bytes") or b"")
-            await socket.send_text(answer.model_dump_json())
+            said = text.encode("utf-8", "replace") if text else bytes(message.get("bytes") or b"")
+            answer = None
+            if is_stop_command(said):
+                self._moved = False
+                self._stops_n += 1
+                answer = await self._stops.carry_out(said, self._client, self._by)
+            if self._waiting.full():
+                await socket.close(POLICY, "more messages than are obeyed")
+                return
+            self._waiting.put_nowait(_Waiting(said, self._stops_n, answer))
 
     async def release(self) -> None:
         """Give the lease back, if this client ever had one. A refusal only says that it has lapsed already."""
@@ -139,12 +194,13 @@ class _JogSession:
             with contextlib.suppress(ProblemError):
                 await obey(self._port, Release(client=self._client), self._limits, self._by)
 
-    async def _answer(self, text: bytes) -> Reply | Problem:
-        if is_stop_command(text):
-            self._moved = False
-            return await self._stops.carry_out(text, self._client, self._by)
+    async def _answer(self, asked: _Waiting) -> Reply | Problem:
+        if asked.answer is not None:
+            return asked.answer
+        if asked.stops_n < self._stops_n:
+            return Problem(error=STOP_CAME_FIRST, where="jog", remedy=STOP_REMEDY)
         try:
-            command = COMMAND.validate_json(text).model_copy(update={"client": self._client})
+            command = COMMAND.validate_json(asked.text).model_copy(update={"client": self._client})
         except ValidationError as error:
             # A client in a loop of nonsense is slowed down; its connection is read again only afterwards.
             await asyncio.sleep(MALFORMED_PAUSE_S)
@@ -222,8 +278,8 @@ class _ManeuverSession:
         """The next message, None: the client has gone. A stop in it is carried out."""
         message = await socket.receive()
         if message["type"] == "websocket.disconnect":
-            if message.get("code") == TOO_LARGE:
-                await self._stops.carry_out(TOO_LARGE_REASON, by=self._by)
+            if (reason := NEVER_READ.get(message.get("code", 0))) is not None:
+                await self._stops.carry_out(reason, by=self._by)
             return None
         text = message.get("text")
         said = text.encode("utf-8", "replace") if text else bytes(message.get("bytes") or b"")

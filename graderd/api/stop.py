@@ -29,8 +29,9 @@ DRAIN_S = 0.5
 """What still comes of the body after the stop is thrown away for so long, so that its sender can read the answer."""
 
 log = logging.getLogger(__name__)
+_AROUND_A_WORD = b" \t\r\n\"'!"
 _MOST_CHARACTERS = {"reason": 200, "client": 80}
-_COMMAND = re.compile(rb'"command"\s*:\s*"stop"')
+_COMMAND = re.compile(rb"""["']?command["']?\s*[:=]\s*["']?stop\b""", re.IGNORECASE)
 
 
 def is_stop_path(path: str) -> bool:
@@ -45,8 +46,9 @@ def is_stop_line(line: bytes) -> bool:
 
 
 def is_stop_command(message: bytes | bytearray, complete: bool = True) -> bool:
-    """Whether a command, or as much of it as has come, asks for a stop: also one that is not valid otherwise."""
-    if _COMMAND.search(message):
+    """Whether a command, or as much of it as has come, asks for a stop: also one that is not valid otherwise, such as a
+    form, what Python prints, or the bare word."""
+    if _COMMAND.search(message) or (complete and message.strip(_AROUND_A_WORD).lower() == b"stop"):
         return True
     if not complete or b"\\u" not in message:
         return False

@@ -112,6 +112,11 @@ Command = Arm | Disarm | Stop | Reset | Auto | Manual | Jog | Preset | Renew | R
 AnyCommand = Annotated[Command, Field(discriminator="command")]
 
 
+STOP_CAME_FIRST = "a stop came first"
+STOP_REMEDY = "read its reason, reset that stop, then ask again"
+"""Told of what was asked before a stop and not done yet."""
+
+
 class Reply(BaseModel):
     """Answer to one command: what happened, and what to do where it was refused."""
 

@@ -24,7 +24,6 @@ from graderd.runtime.state_file import LastStop, StateFile
 MAX_COMMANDS_PER_TICK = 32
 LATENESS_WINDOW_N = 500
 BEFORE = "stopped before the daemon was started"
-STOP_REMEDY = "read its reason, reset that stop, then ask again"
 
 log = logging.getLogger(__name__)
 
@@ -111,9 +110,10 @@ class ControlLoop:
         while self._queue:
             queued, future = self._queue.popleft()
             if not future.done():
-                future.set_result(
-                    cmd.Reply(command=queued.command, accepted=False, message="a stop came first", remedy=STOP_REMEDY)
+                void = cmd.Reply(
+                    command=queued.command, accepted=False, message=cmd.STOP_CAME_FIRST, remedy=cmd.STOP_REMEDY
                 )
+                future.set_result(void)
         return reply
 
     def end(self, reason: str) -> bool:

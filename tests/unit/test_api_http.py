@@ -86,7 +86,7 @@ MALFORMED: list[tuple[bytes, str]] = [
     (b"{", ""),
     (b"[]", "body"),
     (b"null", "body"),
-    (b'"stop"', "body"),
+    (b'"arm"', "body"),
     (b'{"command": "fly"}', "body"),
     (b'{"command": "manual", "now": true}', "manual.now"),
     (b'{"command": "jog", "axis": "rotate", "value": NaN}', "jog.value"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from websockets.asyncio.client import ClientConnection, unix_connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from graderd.api import sockets
 from graderd.api.settings import ApiLimits
 from graderd.client import AsyncClient, RefusedError
 from graderd.core import commands as cmd
@@ -161,6 +163,21 @@ async def test_malformed_messages_are_answered_and_slow_the_client_down(tmp_path
         assert asyncio.get_running_loop().time() - begin_s > 0.4
         assert daemon.seen == []
         assert (await ask(socket, command="stop"))["accepted"]
+
+
+async def test_who_sends_more_than_is_obeyed_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rather than heard ever later: what comes last may be a stop, and must come to somebody or be known not to."""
+    monkeypatch.setattr(sockets, "WAITING_N", 20)
+    async with serving(tmp_path) as (daemon, path):
+        await armed(daemon)
+        async with connect(path, "/v1/jog") as socket:
+            assert (await ask(socket, command="jog", axis="rotate", value=50.0))["accepted"]
+            with suppress(ConnectionClosed):
+                for _ in range(100):
+                    await socket.send('{"command": "renew", "value": NaN}')
+            await within(5, socket.wait_closed())
+            assert socket.close_reason == "more messages than are obeyed"
+        await daemon.until(lambda: daemon.state.lease is None, timeout_s=1.0)
 
 
 async def test_a_message_that_is_too_large_ends_the_connection_and_the_lease(tmp_path: Path) -> None:

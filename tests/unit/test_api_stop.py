@@ -48,6 +48,10 @@ COMMANDS = {
     "20 kB of reason": json.dumps({"command": "stop", "reason": LONG}).encode(),
     "20 kB before it": json.dumps({"reason": LONG, "command": "stop"}).encode(),
     "written with escapes": b'{"command": "\\u0073top", "reason": 5}',
+    "capitals": b'{"Command": "STOP"}',
+    "as Python writes it": b"{'command': 'stop', 'reason': None}",
+    "as a form": b"client=cab&command=stop",
+    "the bare word": b" Stop\n",
 }
 HEADS = {
     "as curl -d sends it": b"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\n"
@@ -129,6 +133,29 @@ async def test_a_stop_on_the_jog_socket_is_as_good(tmp_path: Path, body: bytes) 
     async with serving(tmp_path) as (daemon, path), connect(path, "/v1/jog") as socket:
         await socket.send(body.decode("latin-1"))
         await daemon.until_mode(Mode.STOPPED)
+
+
+async def test_a_stop_on_the_jog_socket_that_is_no_utf_8_is_as_good(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (daemon, path), connect(path, "/v1/jog") as socket:
+        await socket.send('{"command": "stop", "reason": "Räumschild"}'.encode("latin-1"), text=True)
+        await daemon.until_mode(Mode.STOPPED)
+
+
+async def test_a_stop_on_the_jog_socket_overtakes_what_was_sent_before_it(tmp_path: Path) -> None:
+    """A network that stalled, or a client in a loop: what waits is void, and nothing of it undoes the stop."""
+    async with serving(tmp_path) as (daemon, path), connect(path, "/v1/jog") as socket:
+        for _ in range(100):
+            await socket.send('{"command": "renew", "value": NaN}')
+            await socket.send('{"command": "arm"}')
+        await socket.send('{"command": "reset", "stop_n": 1}')
+        await socket.send('{"command": "stop", "reason": "near the blade"}')
+        await socket.send('{"command": "arm"}')
+        answers = [json.loads(await within(5, socket.recv())) for _ in range(203)]
+        assert [answer for answer in answers if answer.get("command") == "stop"] == [answers[201]]
+        assert answers[201]["accepted"]
+        assert answers[200]["error"] == "a stop came first"
+        assert (answers[202]["command"], answers[202]["accepted"]) == ("arm", False)
+        assert (daemon.state.mode, daemon.state.stop_n) == (Mode.STOPPED, 1)
 
 
 @pytest.mark.parametrize("target", [b"/v1/stop", b"/v1/commands"])
