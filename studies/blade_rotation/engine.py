@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
+import select
 import shutil
 import subprocess
 import sys
@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
-POLL_S = 0.1
+LOOK_S = 1.0
 TAIL_BYTES = 4096
 STEP = re.compile(rb"^ *(\d+) +[-+.\deE]+ +[-+.\deE]+ +\d+ *$", re.MULTILINE)
 DANGEROUS = re.compile(r"^Dangerous builds = (\d+)", re.MULTILINE)
@@ -81,17 +81,16 @@ def run(arguments: Sequence[str], folder: Path, log: str, progress: Progress | N
         process = subprocess.Popen(
             arguments, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT
         )
+        # Popen.wait with a timeout looks twenty times a second, which takes from the engine.
+        ended = os.pidfd_open(process.pid)
         try:
-            while True:
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(POLL_S if time.monotonic() - began < 60.0 else 10.0 * POLL_S)
-                    break
+            while not select.select([ended], [], [], LOOK_S)[0]:
                 if progress and (steps := STEP.findall(_tail(folder / log))):
                     progress(int(steps[-1]))
         finally:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
+            os.close(ended)
+            process.kill()  # nothing, where it has ended
+            process.wait()
     if process.returncode:
         raise StudyError(str(folder / log), _why(folder, log, process.returncode), "Look at the end of that file")
     return time.monotonic() - began
