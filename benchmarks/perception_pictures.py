@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.hal.camera import Frame
 from graderd.perception import CameraCalibration, PerceptionSettings
@@ -24,12 +23,11 @@ from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.piles import SceneZone
 from graderd.simulator.grader.soil import SoilField
 from graderd.simulator.grader.world import scene_heights
+from harness.perception_scenes import ON_GROUND
 
 OUT = Path("docs/pictures")
 ANGLE_DEG, WORK_DEG = 20.0, 30.0
 SIZE = (480, 300)
-ON_GROUND = MeasuredAttitude(2.0, 0.0, 0.0)
-"""What the lifts and the tilt measure."""
 
 
 def photograph(look: Appearance) -> Frame:

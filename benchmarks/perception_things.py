@@ -15,13 +15,13 @@ from collections import Counter
 
 import cv2
 
-from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import SoilObservation, Zone
 from graderd.perception import CameraCalibration, PerceptionSettings
 from graderd.perception.classifier import Classifier, make_classifier
 from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.piles import SceneZone
+from harness.perception_scenes import ON_GROUND
 from harness.perception_things import COLOR_SIZE, DEPTH_SIZE, KINDS, SIDES, photograph
 
 OPPOSITE = {Zone.LEFT: SceneZone.RIGHT, Zone.RIGHT: SceneZone.LEFT}
@@ -42,7 +42,7 @@ def sweep(each_n: int) -> list[tuple[str, Zone, SceneZone, float, SoilObservatio
                     loaded = OPPOSITE.get(side, SceneZone.LEFT if number % 4 == 1 else SceneZone.RIGHT)
                 angle_deg = (-30.0, 0.0, 15.0, 45.0)[number // 2 % 4]
                 frame = photograph(renderer, kind, side, loaded, angle_deg, number)
-                observation = judge.classify(frame, angle_deg, 0.0, MeasuredAttitude(2.0, 0.0, 0.0))
+                observation = judge.classify(frame, angle_deg, 0.0, ON_GROUND)
                 found.append((kind, side, loaded, angle_deg, observation))
     return found
 

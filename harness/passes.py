@@ -14,7 +14,6 @@ import numpy as np
 from graderd.config import Config
 from graderd.config.tick import tick_settings
 from graderd.core import commands as cmd
-from graderd.core.attitude import MeasuredAttitude
 from graderd.core.axes import ACTUATORS
 from graderd.core.machine import Mode
 from graderd.core.soil import OPPOSITE, SoilObservation, Zone
@@ -35,15 +34,13 @@ from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.piles import SceneZone
 from graderd.simulator.grader.world import World, scene_heights
 from graderd.simulator.servo.motion import Profile, Trajectory
+from harness.perception_scenes import ON_GROUND
 
 DRIVE_M = 3.0
 SETTLED_DEG = 0.7
 UNDECIDED_S = 4.0
 """No decision for so long: the machine drives all the same."""
 FIXED_DEG = 15.0
-
-ON_GROUND = MeasuredAttitude(2.0, 0.0, 0.0)
-"""What the lifts and the tilt measure while the edge drags."""
 
 
 @dataclass(frozen=True, slots=True)

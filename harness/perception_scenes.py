@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry, blade_coordinates
 from graderd.core.soil import Zone
 from graderd.hal.camera import Frame
@@ -23,6 +24,9 @@ F64 = npt.NDArray[np.float64]
 
 CELL_M = 0.01
 X0, X1, Y0, Y1 = -2.2, 1.2, -1.5, 1.5
+
+ON_GROUND = MeasuredAttitude(2.0, 0.0, 0.0)
+"""What the lifts and the tilt measure while the edge drags."""
 
 
 @dataclass(frozen=True)

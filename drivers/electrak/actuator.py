@@ -104,11 +104,6 @@ class ElectrakActuator:
         self._watch(self._clock.now_s())
         return self._lifecycle
 
-    @property
-    def j1939_name(self) -> int | None:
-        """The 64-bit NAME it claimed its address with, if a claim was heard."""
-        return self._claimed_name
-
     def telemetry(self) -> ActuatorTelemetry:
         """Newest readings, each with its time."""
         feedback, at_s = self._track.feedback, self._track.feedback_at_s

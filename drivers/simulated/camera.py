@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import socket
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -189,8 +188,3 @@ class RigCamera:
 def _lens(values: list[float]) -> Intrinsics:
     width, height, fx, fy, cx, cy = values
     return Intrinsics(int(width), int(height), fx, fy, cx, cy)
-
-
-def camera_socket(directory: Path) -> Path:
-    """Where a rig that lives in ``directory`` serves its camera."""
-    return directory / "camera.sock"

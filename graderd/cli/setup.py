@@ -41,7 +41,6 @@ CLEAR_MM: Final = 40.0
 ABOVE_MM: Final = 5.0
 UNPLUG: Final = "unplug"
 ACTUATORS: Final = (*LIFTS, "tilt")
-OWN_ADDRESSES: Final = {"lift_left": 19, "lift_right": 20, "tilt": 27}
 QUESTIONS: Final = (
     ("servo.port", "the servo's adapter: path, number in the list, or 'unplug'"),
     ("can.channel", "the actuators' bus: interface, port of an slcan adapter, or number in the list"),

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from graderd.core.soil import OPPOSITE, ColorMethod, SoilObservation, Zone
-from graderd.perception.settings import LABELS, PerceptionSettings, SiteFigure
+from graderd.core.soil import OPPOSITE, SoilObservation, Zone
+from graderd.perception.settings import COLOR_METHODS, LABELS, PerceptionSettings, SiteFigure
 
 PILES = (Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN)
 
@@ -91,12 +91,9 @@ def site_figure(score: Score, settings: PerceptionSettings, measured_at: str) ->
     Raises:
         ValueError: the method is none that goes by colour alone.
     """
-    method: ColorMethod
-    match settings.method:
-        case "paper" | "fast_color" as method:
-            pass
-        case other:
-            raise ValueError(f"{other} does not go by colour")
+    method = next((method for method in COLOR_METHODS if method == settings.method), None)
+    if method is None:
+        raise ValueError(f"{settings.method} does not go by colour")
     return SiteFigure(
         method=method,
         settings_mark=settings.color_mark(),

@@ -18,6 +18,8 @@ from graderd.hal.camera import Intrinsics, StreamPose
 from graderd.hal.settings import Finite, NotNegative, Positive, Settings
 
 METHODS: tuple[Method, ...] = get_args(Method)
+COLOR_METHODS: tuple[ColorMethod, ...] = get_args(ColorMethod)
+"""Those that look at the colour picture alone."""
 
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Percent = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
@@ -243,7 +245,7 @@ class PerceptionSettings(Settings):
 
         Colour takes rust, plywood and shade for soil: it drives only where frames of the site have shown its worth.
         """
-        if self.method in ("depth", "fused"):
+        if self.method not in COLOR_METHODS:
             return ""
         figure = self.color.site_figure
         if figure is None or figure.method != self.method:

@@ -14,7 +14,7 @@ from graderd.drivers.dynamixel.table import ControlTable, Register
 from graderd.simulator.servo.memory import ControlMemory
 from graderd.simulator.servo.motion import CATCH_UP_S, STEP_S, Plant, PlantSettings, Profile, Trajectory
 
-CURRENT_MODE, VELOCITY_MODE, POSITION_MODE, EXTENDED_MODE, PWM_MODE = 0, 1, 3, 4, 16
+CURRENT_MODE, VELOCITY_MODE, POSITION_MODE, EXTENDED_MODE = 0, 1, 3, 4
 _WATCHDOG_STEP_S = 0.020
 _WATCHDOG_TRIPPED = -1
 _TIME_PROFILE, _REVERSE, _TORQUE_BY_GOAL = 0x04, 0x01, 0x08

@@ -29,6 +29,18 @@ def test_a_walk_leads_over_files_that_are_there_and_is_short(title: str) -> None
     assert [name for name in files if not (PROJECT / name).is_file()] == []
 
 
+def test_what_a_walk_names_is_in_its_file() -> None:
+    """A name behind a file, in brackets, is what to look for there."""
+    named = [
+        (file, name)
+        for file, text in re.findall(r"`([\w/]+\.py)`\s+\(([^)]*)\)", PAGE)
+        for name in re.findall(r"`(\w+)`", text)
+    ]
+    assert len(named) > 3
+    for file, name in named:
+        assert re.search(rf"(def|class|import) {name}\b|\b{name}\(", (PROJECT / file).read_text(encoding="utf-8")), name
+
+
 def test_no_walk_without_a_bound() -> None:
     assert set(WALKS) == set(LONGEST_N)
 

@@ -11,13 +11,21 @@ import pytest
 from graderd.cli.app import run_app
 from graderd.config.loader import load
 from graderd.core.blade import BladeGeometry
-from graderd.core.soil import Zone
+from graderd.core.soil import Method, Zone
 from graderd.hal.camera import Frame
-from graderd.perception import CameraCalibration, PerceptionSettings, classifier
+from graderd.perception import METHODS, CameraCalibration, PerceptionSettings, classifier
 from graderd.perception.decide import Verdict
 from graderd.perception.frame_set import Entry, FrameSetWriter
 from graderd.perception.geometry import U8, Region
-from graderd.perception.settings import FRAMES_LEAST_N, ColorSettings, DecisionSettings, SiteFigure, StreamCalibration
+from graderd.perception.scoring import Score, site_figure
+from graderd.perception.settings import (
+    COLOR_METHODS,
+    FRAMES_LEAST_N,
+    ColorSettings,
+    DecisionSettings,
+    SiteFigure,
+    StreamCalibration,
+)
 
 Captured = pytest.CaptureFixture[str]
 ZONES = (Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN, Zone.NONE)
@@ -132,3 +140,13 @@ def test_a_figure_speaks_for_its_own_method_and_settings_alone() -> None:
 )
 def test_a_figure_written_by_hand_is_judged_again(other: dict[str, float]) -> None:
     assert "is not good enough" in figure_for(PerceptionSettings(method="fast_color"), **other).why_not_to_drive()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_colour_method_and_no_other_can_have_a_figure(method: Method) -> None:
+    settings = PerceptionSettings(method=method)
+    if method in COLOR_METHODS:
+        assert site_figure(Score(), settings, "today").method == method
+    else:
+        with pytest.raises(ValueError, match="does not go by colour"):
+            site_figure(Score(), settings, "today")

@@ -30,7 +30,7 @@ from graderd.simulator.camera.optics import knocked
 from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.soil import SoilField
-from harness.perception_scenes import Scene, render
+from harness.perception_scenes import ON_GROUND, Scene, render
 
 pytestmark = pytest.mark.slow
 
@@ -189,6 +189,6 @@ def test_a_blade_far_off_its_drawing_is_refused() -> None:
     for angle in (-40.0, 0.0, 40.0):
         scene = Scene(angle_deg=angle, seed=int(angle) + 50, blade=raised)
         frame = render(scene, NOMINAL, color_size=(640, 400), depth_size=(424, 240))
-        views.append(EmptyBlade(frame, angle, MeasuredAttitude(2.0, 0.0, 0.0)))
+        views.append(EmptyBlade(frame, angle, ON_GROUND))
     with pytest.raises(CalibrationError, match=r"comes out as .* mm off the .* configured"):
         calibrate(views, NOMINAL, BladeGeometry())

@@ -13,7 +13,6 @@ from types import ModuleType
 
 import pytest
 
-from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Zone
 from graderd.hal.camera import Frame
@@ -32,7 +31,7 @@ from graderd.perception import (
     registration,
 )
 from graderd.perception.geometry import View
-from harness.perception_scenes import PoseError, Scene, render
+from harness.perception_scenes import ON_GROUND, PoseError, Scene, render
 
 MODULES: tuple[ModuleType, ...] = (registration, ground, forms, depth)
 STATED: tuple[ModuleType, ...] = (*MODULES, calibration, calibration_evidence, classifier, color, geometry, health)
@@ -96,10 +95,10 @@ def test_no_tuned_number_stands_in_the_code(module: ModuleType) -> None:
 SCENES = (
     (
         Scene(zone=Zone.LEFT, angle_deg=20.0, seed=1, noise_px=0.15, pose=PoseError(z_m=0.02, pitch_deg=1.5)),
-        MeasuredAttitude(2.0, 0.0, 0.0),
+        ON_GROUND,
     ),
-    (Scene(zone=Zone.EVEN, seed=4, noise_px=0.15), MeasuredAttitude(2.0, 0.0, 0.0)),
-    (Scene(zone=Zone.NONE, angle_deg=40.0, seed=5, noise_px=0.15), MeasuredAttitude(2.0, 0.0, 0.0)),
+    (Scene(zone=Zone.EVEN, seed=4, noise_px=0.15), ON_GROUND),
+    (Scene(zone=Zone.NONE, angle_deg=40.0, seed=5, noise_px=0.15), ON_GROUND),
 )
 
 

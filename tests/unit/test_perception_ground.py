@@ -15,9 +15,8 @@ from graderd.perception import CameraCalibration, PerceptionSettings
 from graderd.perception.classifier import make_classifier
 from graderd.perception.geometry import F64, View
 from graderd.perception.ground import Ground, GroundFit
-from harness.perception_scenes import CELL_M, X0, Y0, Scene, render
+from harness.perception_scenes import CELL_M, ON_GROUND, X0, Y0, Scene, render
 
-ON_GROUND = MeasuredAttitude(2.0, 0.0, 0.0)
 Shape = Callable[[F64, F64], F64]
 
 

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.camera import Frame
@@ -24,7 +23,7 @@ from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.piles import SceneZone
 from graderd.simulator.grader.world import World, scene_heights
-from harness.perception_scenes import PoseError, Scene, render
+from harness.perception_scenes import ON_GROUND, PoseError, Scene, render
 
 pytestmark = pytest.mark.slow
 
@@ -222,7 +221,7 @@ def test_soil_heaped_against_the_face_is_not_taken_for_the_face() -> None:
     color, depth = renderer.render(seen, Appearance())
     frame = Frame(color, depth, renderer.color_intrinsics, renderer.depth_intrinsics, 0.0)
     classifier = make_classifier(PerceptionSettings(), CameraCalibration(), BladeGeometry(), live=False)
-    observation = classifier.classify(frame, angle_deg, 0.01, MeasuredAttitude(2.0, 0.0, 0.0))
+    observation = classifier.classify(frame, angle_deg, 0.01, ON_GROUND)
     assert named(observation) == []
     assert observation.volume_left_l == pytest.approx(left_l, rel=0.15)
     # What is cut and a layer of soil look the same: where no lift tells which, nobody knows.

@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry, meeting_point
 from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.camera import Frame
@@ -21,6 +20,7 @@ from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.piles import SceneZone
 from graderd.simulator.grader.world import World, scene_heights
+from harness.perception_scenes import ON_GROUND
 
 BLADE = BladeGeometry()
 CELL_M = 0.01
@@ -107,7 +107,7 @@ def test_what_a_turned_blade_will_meet_is_told_from_the_picture(zone: Zone, angl
 
 def look(zone: Zone, angle_deg: float, method: Method = "depth") -> SoilObservation:
     classifier = make_classifier(PerceptionSettings(method=method), CameraCalibration(), BLADE, live=False)
-    return classifier.classify(picture(zone, angle_deg), angle_deg, 0.01, MeasuredAttitude(2.0, 0.0, 0.0))
+    return classifier.classify(picture(zone, angle_deg), angle_deg, 0.01, ON_GROUND)
 
 
 @cache

@@ -7,7 +7,6 @@ import functools
 import numpy as np
 import pytest
 
-from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.camera import Frame
@@ -23,9 +22,8 @@ from graderd.simulator.camera.shapes import Solid
 from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.piles import SceneZone
 from graderd.simulator.grader.soil import SoilField
+from harness.perception_scenes import ON_GROUND
 from harness.perception_things import COLOR_SIZE, DEPTH_SIZE, SIDES, VEHICLE_X_M, photograph
-
-ON_GROUND = MeasuredAttitude(2.0, 0.0, 0.0)
 
 
 @functools.cache

@@ -20,7 +20,8 @@ from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.piles import SceneZone
 from graderd.simulator.grader.world import World, scene_heights
-from harness.passes import DRIVE_M, ON_GROUND, Case, LoopPass, fixed_width_mm, loop_config, loop_pass
+from harness.passes import DRIVE_M, Case, LoopPass, fixed_width_mm, loop_config, loop_pass
+from harness.perception_scenes import ON_GROUND
 
 pytestmark = pytest.mark.slow
 
