@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from graderd.config import Config
@@ -90,6 +90,7 @@ class ControlLoop:
         self._queue: deque[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = deque()
         self._refused: dict[str, str] = {}
         self._keep_last_stop = False
+        self._armed_by = ""
         self.sensed = self._sensed(())
         self.tick = self.controller.step(self.sensed)
 
@@ -161,7 +162,14 @@ class ControlLoop:
             self.on_step(self.sensed, self.tick)
         return self.tick.replies
 
+    def _obeyed(self) -> Iterator[cmd.Command]:
+        """The commands of this tick that were accepted."""
+        return (c for c, reply in zip(self.sensed.commands, self.tick.replies, strict=True) if reply.accepted)
+
     def _note(self, before: State, after: State) -> None:
+        for command in self._obeyed():
+            if isinstance(command, cmd.Arm):
+                self._armed_by = command.client
         if after.mode is Mode.STOPPED:
             # A second reason as well as the first: who starts the daemon anew has to know both.
             if after.stops != before.stops and not self._keep_last_stop:
@@ -173,8 +181,9 @@ class ControlLoop:
 
     def _tell_transition(self, before: Mode, after: State) -> None:
         """Who or what changed the mode stands in fields of its own beside the text."""
-        obeyed = (c for c, reply in zip(self.sensed.commands, self.tick.replies, strict=True) if reply.accepted)
-        client = next((command.client for command in obeyed if command.client), "")
+        client = next((command.client for command in self._obeyed() if command.client), "")
+        if before is Mode.DISARMED and after.mode is Mode.MANUAL:
+            client = self._armed_by  # asked for before the devices were powered
         fault = next((f.name for f in self.tick.faults if after.reason.startswith(f"{f.name}: ")), "")
         fields = {"event": True, "mode": after.mode, "client": client, "fault": fault}
         log.info("%s -> %s: %s", before, after.mode, after.reason, extra=fields)

@@ -13,11 +13,13 @@ import pytest
 
 from graderd.config import Config
 from graderd.core import commands as cmd
+from graderd.core.faults.catalogue import find_rows
 from graderd.core.machine import Mode
 from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceRefusedError
 from graderd.hal.fault import DeviceFault
+from graderd.runtime.app.journal import fields_of
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.control import log as control_log
 from graderd.runtime.state_file import StateFile
@@ -461,3 +463,18 @@ async def test_a_late_tick_is_told_for_a_second_and_a_long_one_beside_it(bench: 
     assert {f.name for f in bench.loop.tick.faults} == {"daemon.loop_blocked", "daemon.tick_overrun"}
     await bench.ticks(50)
     assert bench.loop.tick.faults == ()
+
+
+async def test_the_journal_has_mode_client_and_a_fault_that_explain_knows(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "graderd")
+    await bench.arm()
+    bench.machine.rotation.lose()
+    await bench.ticks(100)
+    told = [fields_of(record) for record in caplog.records if getattr(record, "event", False)]
+    assert told[0] == {"mode": "manual", "client": "t"}
+    (ended,) = [fields for fields in told if "fault" in fields]
+    assert ended["mode"] == bench.loop.tick.state.mode
+    assert ended["fault"].startswith("rotation.")
+    assert find_rows(ended["fault"]) != ()
