@@ -155,7 +155,8 @@ def _note(axis: Mapping[str, Any]) -> str:
 def _soil(status: Status) -> Iterator[Line]:
     soil = status["soil"]
     sure = f", {soil['confidence']:.0%} sure" if soil["zone"] != "unknown" else ""
-    yield Line(f"soil {soil['zone']}{sure}, {number(soil['age_s'], 's old', 2)}: {soil['reason']}")
+    age = "" if soil["age_s"] is None else f", {number(soil['age_s'], 's old', 2)}"
+    yield Line(f"soil {soil['zone']}{sure}{age}: {soil['reason']}")
     thirds = [f"{third} {soil[f'share_{third}']:.0%}" for third in THIRDS if soil[f"share_{third}"] is not None]
     if thirds:
         yield Line(f"  shares   {'  '.join(thirds)}", "plain", 6)
@@ -184,7 +185,8 @@ def _rest(status: Status) -> Iterator[Line]:
     late = f"p99 {tick['lateness_p99_ms']:.1f} ms late, {tick['overruns_n']} overruns"
     yield Line(f"graderd  {status['version']} ({where}), {tick['rate_hz']:.0f} Hz, {late}", "dim", 8)
     restarts = f", restarted {camera['restarts_n']} times" if camera["restarts_n"] else ""
-    yield Line(f"camera   {camera['lifecycle']}{restarts}, {camera['description']}", "plain", 5)
+    described = f", {camera['description']}" if camera["description"] else ""
+    yield Line(f"camera   {camera['lifecycle']}{restarts}{described}", "plain", 5)
 
 
 def shown(found: Sequence[Line]) -> str:

@@ -5,7 +5,7 @@ Names are found and nothing is opened: looking disturbs nobody.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 ARPHRD_CAN = 280
 """The kernel's number for a CAN interface (``include/uapi/linux/if_arp.h``)."""
+
+RIG_ADAPTERS = ("servo", "can")
+"""Names in a rig's folder that come and go with their plugs (docs/developers/rig.md)."""
 
 
 class Wires(Protocol):
@@ -81,14 +84,13 @@ class MachineWires:
 
 @dataclass(frozen=True)
 class RigWires:
-    """A simulated grader's: ``config`` is the one that runs on it (``graderd.runtime.app.on_rig``)."""
+    """A simulated grader's, by its folder. ``config``: one that runs on it (``graderd.runtime.app.on_rig``)."""
 
+    directory: Path
     config: Config
-    _adapters: tuple[str, ...] = field(default=("servo", "can"))
 
     def serial_ports(self) -> dict[str, str]:
-        folder = Path(str(self.config.camera.path)).parent
-        ports = [folder / name for name in self._adapters]
+        ports = [self.directory / name for name in RIG_ADAPTERS]
         return {str(port): "simulated serial adapter" for port in ports if port.exists()}
 
     def can_interfaces(self) -> dict[str, str]:

@@ -51,6 +51,7 @@ QUESTIONS: Final = (
     ("servo.which", "which of the servos found"),
     ("lift_left.address, lift_right.address, tilt.address", "an actuator's address on the bus"),
     ("rotation", "zero, sign and limits now? y or n"),
+    ("rotation.square, rotation.aside, rotation.left_back, rotation.right_back", "Enter, once the blade stands there"),
     ("rotation.clear, rotation.back, rotation.write", "of 'graderd calibrate rotation'"),
     ("stop.square", "Enter, once the blade stands about square"),
     ("stop.command, stop.switch, stop.death", "consent to each test of the stop: the blade turns"),
@@ -119,11 +120,11 @@ def _set_up(running: Client, path: Path, rig_dir: Path | None, record_path: Path
     from graderd.cli.calibrate import may_write
     from graderd.commissioning import Commissioning
 
-    wires = _wires(rig_dir)
     if rig_dir is None and is_running(running):
         raise CliError("setup", "a daemon runs, and has the wires", "sudo systemctl stop graderd, then do it again")
     _begin_file(path)
     may_write(path)
+    wires = _wires(rig_dir, path)
     record = Commissioning(record_path)
     with SetupDaemon(path.absolute()) as daemon:
         conversation = _Setup(path, wires, record, daemon)
@@ -146,16 +147,17 @@ def config_is_elsewhere(path: Path) -> bool:
     return path.absolute() != places.CONFIG
 
 
-def _wires(rig_dir: Path | None) -> Wires:
-    from graderd.config import Config
+def _wires(rig_dir: Path | None, path: Path) -> Wires:
+    from graderd.cli.calibrate import load_config
     from graderd.hal.settings import StopInputSettings
     from graderd.runtime.app import on_rig
     from graderd.wires import MachineWires, RigWires
 
     if rig_dir is None:
         return MachineWires()
-    asked = Config(stop_input=StopInputSettings(backend="simulated"))
-    return RigWires(on_rig(asked, rig_dir.absolute()))
+    present = load_config(path, must_exist=True)
+    asked = present.model_copy(update={"stop_input": StopInputSettings(backend="simulated")})
+    return RigWires(rig_dir.absolute(), on_rig(asked, rig_dir.absolute()))
 
 
 def _begin_file(path: Path) -> None:

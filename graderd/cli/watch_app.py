@@ -73,6 +73,7 @@ class WatchApp(App[None]):
     """See the module's text. ``address``: the daemon's socket; ``pad``: an event device."""
 
     CSS = "Screen { overflow: hidden; } Static { height: auto; } #foot { dock: bottom; height: 3; }"
+    TITLE = "graderd watch"
     ENABLE_COMMAND_PALETTE = False
     BINDINGS: ClassVar[list[BindingType]] = []
 
