@@ -65,7 +65,7 @@ class Reset(_Command):
 
 
 class Auto(_Command):
-    """Let the rule turn the blade by what the camera sees."""
+    """Let the rule turn the blade by what the camera sees; refused while a fault is active that ends it."""
 
     command: Literal["auto"] = "auto"
 

@@ -258,6 +258,9 @@ def _obey(state: State, command: cmd.Command, inputs: Inputs, settings: MachineS
                 return yes(state, "already automatic")
             if inputs.unmet_for_auto:
                 return no(*_told(inputs.unmet_for_auto))
+            ends = worst(f for f in inputs.faults if f.row.reaction is Reaction.RETREAT)
+            if ends is not None:  # in the next tick it would be manual again
+                return no(f"{ends.name}: {ends.row.reads}", ends.row.remedy)
             return yes(replace(_manual(state, "automatic operation"), mode=Mode.AUTO), "automatic")
         case cmd.Manual():
             if state.mode not in ARMED:

@@ -189,6 +189,18 @@ def test_a_fault_that_stops_is_a_stop_of_its_own_also_beside_and_after_another()
     assert do(beside, cmd.Reset(stop_n=beside.stop_n), faults=gone).state.mode is Mode.DISARMED
 
 
+def test_automatic_operation_that_would_end_in_the_next_tick_is_refused_with_its_reason() -> None:
+    """Told that it is automatic, a person would turn away from a machine that is not."""
+    manual = do(AUTO, cmd.Manual(), devices_active=True).state
+    asked = do(manual, cmd.Auto(), faults=(fault(Reaction.RETREAT),), devices_active=True)
+    assert not asked.replies[0].accepted
+    assert asked.replies[0].message.startswith("camera.test: ")
+    assert asked.replies[0].remedy
+    assert asked.state.mode is Mode.MANUAL
+    for passing in (Reaction.WARN, Reaction.HOLD):  # a hold goes by itself, and is told
+        assert do(manual, cmd.Auto(), faults=(fault(passing),), devices_active=True).state.mode is Mode.AUTO
+
+
 def test_a_reset_clears_the_stop_it_names_and_none_that_came_after() -> None:
     first = do(AUTO, cmd.Stop(reason="dog on the site"), devices_active=True).state
     second = do(first, cmd.Stop(reason="child on the site")).state
