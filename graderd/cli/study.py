@@ -158,6 +158,23 @@ def register(app: typer.Typer) -> None:
         else:
             print_text(f"wrote {page}, of {piles_n} piles")
 
+    @group.command(name="rig-soil", epilog=example("graderd study rig-soil", "graderd study rig-soil --store results"))
+    def rig_soil(store: Where = STORE, json: Json = False) -> None:
+        """Fit the simulated rig's soil to the runs with grains of the 1 m blade, and say how well that goes.
+
+        Compares spread, casting and load at each angle, before and after the fit. Writes rig-soil.md into the store's
+        folder.
+        """
+        with _told():
+            from graderd.studies.blade_rotation import rig_soil as fitted
+            from graderd.studies.blade_rotation.store import Store
+
+            page = fitted.write(Store(store))
+        if json:
+            print_json({"event": "rig_soil_written", "page": str(page)})
+        else:
+            print_text(f"wrote {page}")
+
     @group.command(epilog=example("graderd study rule", "graderd study rule my-blade.toml --save rule.toml"))
     def rule(
         case: Annotated[
