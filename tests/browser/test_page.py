@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -319,6 +320,28 @@ def test_a_lease_that_lapsed_is_not_taken_again_by_a_hand_that_did_not_move(cab:
     cab.until(lambda s: s["lease"] is None, "lapsed")
     cab.wire.held.clear()
     held_still(cab, page)
+
+
+def test_beside_somebody_elses_lease_the_page_names_it_and_moves_nothing(cab: Cab) -> None:
+    page = at_hand(cab)
+    words = ("jog", "rotate", "-25deg" if cab.measured() > 0 else "+25deg", "--hold-s", "8")
+    command = [sys.executable, "-m", "graderd", "--socket", str(cab.directory / "graderd.sock"), *words]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as other:
+        try:
+            holder = cab.until(lambda s: s["lease"] is not None, "the other's lease")["lease"]["client"]
+            expect(page.locator("[data-v=lease]")).to_contain_text(holder)
+            hold(page, "#jog-height\\+")
+            before_mm = cab.measured("lift_left")
+            page.wait_for_timeout(700)
+            status = cab.status()
+            assert status["lease"] is not None
+            assert status["lease"]["client"] == holder
+            assert abs(cab.measured("lift_left") - before_mm) < 1.0
+            expect(page.locator("#said")).not_to_be_empty()
+            page.mouse.up()
+        finally:
+            other.terminate()
+    cab.until(lambda s: s["lease"] is None, "the lease given back")
 
 
 def test_nothing_moves_by_back_refresh_or_autofill(cab: Cab) -> None:
