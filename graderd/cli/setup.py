@@ -317,6 +317,7 @@ class _Setup:
         config = self.config()
         self._about_square(config)
         stops = tested_stops(self.daemon(), config.rotation.model_dump(mode="json"), config.stop_input.backend)
+        _unlatched(self._daemon.client)  # the one that was started after the last test
         self._daemon.client.command("disarm")
         return {"stops": stops}
 
