@@ -152,7 +152,7 @@ web-test: $(STAMP) ## the operator page in a headless Chromium, on rig and daemo
 study: $(STUDY) ## install what `graderd study` needs into .venv (once, 200 MB to download)
 
 study-test: $(STUDY) ## the study's tests on its engine: single grains, small piles, killed workers
-	@$(TESTS) -o addopts="-ra --strict-markers --strict-config" $(PYTEST_ARGS) tests/study
+	@$(TESTS) -n 2 --dist loadfile -o addopts="-ra --strict-markers --strict-config" $(PYTEST_ARGS) tests/study
 
 $(STUDY): $(STAMP) studies/requirements.lock
 	@$(INSTALL) --only-binary :all: --require-hashes -r studies/requirements.lock >$(LOG) 2>&1 || $(because)

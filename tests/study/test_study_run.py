@@ -122,6 +122,15 @@ def test_a_killed_run_goes_on_where_its_last_restart_file_is(tmp_path: Path) -> 
         assert result.measures[name] == pytest.approx(expected.measures[name], rel=0.1)
 
 
+def test_two_ranks_are_one_run(tmp_path: Path) -> None:
+    case = CASE.model_copy(update={"grains_n": 60, "travel_m": 0.2, "seed": 3})
+    one, two = run_case(case, Store(tmp_path / "one")), run_case(case, Store(tmp_path / "two"), ranks_n=2)
+    log = next((tmp_path / "two").glob("runs/*/push.0.0.log")).read_text(encoding="utf-8")
+    assert "on 2 procs" in log
+    assert two.checks["grains_lost_n"] == 0
+    assert two.measures["blade_load_n"] == pytest.approx(one.measures["blade_load_n"], rel=0.1)
+
+
 def test_the_engines_own_error_is_told(tmp_path: Path) -> None:
     (tmp_path / "wrong.in").write_text("units nonsense\n")
     with pytest.raises(StudyError, match=r"ERROR.*units"):
