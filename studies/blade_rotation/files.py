@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graderd.studies.blade_rotation.lammps import FORCES
+from graderd.studies.blade_rotation.lammps import FORCES, PUSHED, TURNED
 from graderd.studies.blade_rotation.pile import F64
 
 GRAIN = ("id", "x", "y", "z", "radius", "vx", "vy", "vz")
@@ -44,13 +44,18 @@ def _frames_of(path: Path) -> Iterator[tuple[int, F64]]:
 
 def forces(folder: Path) -> F64:
     """Rows of :data:`~.lammps.FORCES` in the order of time."""
-    found: dict[int, list[float]] = {}
-    for path in _in_order(folder, "forces.*.txt"):
-        for line in path.read_text(encoding="ascii").split("\n")[:-1]:
-            if not line.startswith("#") and len(words := line.split()) == len(FORCES) + 1:
-                found[int(words[0])] = [float(word) for word in words[1:]]
-    rows = [found[step] for step in sorted(found)]
+    pushed, turned = _means(folder, "forces", len(PUSHED)), _means(folder, "moments", len(TURNED))
+    rows = [pushed[step] + turned[step] for step in sorted(pushed) if step in turned]
     return np.array(rows, dtype=np.float64).reshape(-1, len(FORCES))
+
+
+def _means(folder: Path, kind: str, columns_n: int) -> dict[int, list[float]]:
+    found: dict[int, list[float]] = {}
+    for path in _in_order(folder, f"{kind}.*.txt"):
+        for line in path.read_text(encoding="ascii").split("\n")[:-1]:
+            if not line.startswith("#") and len(words := line.split()) == columns_n + 1:
+                found[int(words[0])] = [float(word) for word in words[1:]]
+    return found
 
 
 def along(folder: Path) -> dict[int, F64]:

@@ -29,17 +29,22 @@ from graderd.studies.blade_rotation.contact import (
 from graderd.studies.blade_rotation.pile import F64
 
 SAMPLE_STEPS = 10
-"""Forces are looked at every so many steps: a thousandth of a second or so."""
+"""What takes a look at every grain is looked at every so many steps."""
 MEAN_SAMPLES = 10
-"""And written as means of so many."""
+"""And written as means of so many. Forces are looked at every step: contacts come and go within a few, and a mean of
+samples would be off by some percent."""
 ALONG_N = 20
 """Parts of the blade's length that the load along it is told in."""
 SETTLE_S = 1.0
 THICK_M = 0.08
 """Of the blade's body behind its face: no grain passes through it in a step."""
-FORCES = ("time", "dx", "dy", "dz", "theta", "fx", "fy", "fz", "mx", "my", "mz", "touching", "floor_x", "floor_y", "px")
-"""Columns of the file of forces after the step: the blade's place (m, rad), force (N) and moment (N m) *on the blade*
-about its axis on the floor, grains in contact, force on the soil by the floor, the soil's momentum along the travel."""
+PUSHED = ("time", "dx", "dy", "dz", "theta", "fx", "fy", "fz", "floor_x", "floor_y")
+"""Columns of the file of forces after the step: the blade's place (m, rad), force (N) *on the blade*, force on the soil
+by the floor."""
+TURNED = ("mx", "my", "mz", "touching", "px")
+"""And of the file of moments: moment (N m) on the blade about its axis on the floor, grains in contact, the soil's
+momentum along the travel."""
+FORCES = PUSHED + TURNED
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,9 +205,6 @@ def _written(case: Case, frame_steps: int, name: str) -> str:
     half = case.blade.length_m / 2.0
     x, y, z = ("(W[5]-v_dx)", "(W[6]-v_dy)", "(W[7]-v_dz)")
     atoms = {
-        "wfx": both("W[2]"),
-        "wfy": both("W[3]"),
-        "wfz": both("W[4]"),
         "wmx": both(f"({y}*W[4]-{z}*W[3])"),
         "wmy": both(f"({z}*W[2]-{x}*W[4])"),
         "wmz": both(f"({x}*W[3]-{y}*W[2])"),
@@ -211,28 +213,32 @@ def _written(case: Case, frame_steps: int, name: str) -> str:
     }
     lines = [f"variable {key} atom {value}" for key, value in atoms.items()]
     lines.append(f"compute on_soil all reduce sum {' '.join(f'v_{key}' for key in atoms)}")
-    lines.append("compute on_floor all reduce sum f_floor[2] f_floor[3]")
+    sums = [f"f_{wall}[{column}]" for wall in walls for column in (2, 3, 4)]
+    lines.append(f"compute pushed all reduce sum {' '.join(sums)} f_floor[2] f_floor[3]")
+    for number, key in enumerate(("fx", "fy", "fz"), 1):
+        parts = "+".join(f"c_pushed[{number + 3 * wall}]" for wall in range(len(walls)))
+        lines.append(f"variable {key} equal -({parts})")
+    lines += [f"variable {key} equal -c_on_soil[{number}]" for number, key in enumerate(("mx", "my", "mz"), 1)]
     lines += [
-        f"variable {key} equal -c_on_soil[{number}]"
-        for number, key in enumerate(("fx", "fy", "fz", "mx", "my", "mz"), 1)
-    ]
-    lines += [
-        "variable touching equal c_on_soil[7]",
-        "variable px equal c_on_soil[8]",
-        "variable floor_x equal c_on_floor[1]",
-        "variable floor_y equal c_on_floor[2]",
+        "variable touching equal c_on_soil[4]",
+        "variable px equal c_on_soil[5]",
+        f"variable floor_x equal c_pushed[{len(sums) + 1}]",
+        f"variable floor_y equal c_pushed[{len(sums) + 2}]",
         "variable time equal v_now",
     ]
     window = SAMPLE_STEPS * MEAN_SAMPLES
-    sampled = f"{SAMPLE_STEPS} {MEAN_SAMPLES} {window}"
-    columns = " ".join(f"v_{key}" for key in FORCES)
-    lines.append(f'fix forces all ave/time {sampled} {columns} file forces.{name}.txt format " %.9g"')
+    for kind, columns, sampled in (
+        ("forces", PUSHED, f"1 {window} {window}"),
+        ("moments", TURNED, f"{SAMPLE_STEPS} {MEAN_SAMPLES} {window}"),
+    ):
+        values = " ".join(f"v_{key}" for key in columns)
+        lines.append(f'fix {kind} all ave/time {sampled} {values} file {kind}.{name}.txt format " %.9g"')
     # Along the blade: what each part of it is pushed with, square to its face. (fix ave/histo/weight would be shorter;
     # with two variables of atoms it weighs the first by itself, 22 Jul 2025.)
     part = f"(-(x-v_dx)*sin(v_theta)+(y-v_dy)*cos(v_theta)+{half:.6g})*{ALONG_N / case.blade.length_m:.9g}"
     lines += [
         f"variable part atom ceil({part})*(v_wn>0)",
-        "variable push atom v_wfx*cos(v_theta)+v_wfy*sin(v_theta)",
+        f"variable push atom ({both('W[2]')})*cos(v_theta)+({both('W[3]')})*sin(v_theta)",
         f"compute parts all chunk/atom v_part limit {ALONG_N} exact discard yes",
         "compute along all reduce/chunk parts sum v_push",
         f"fix along all ave/time {SAMPLE_STEPS} {frame_steps // SAMPLE_STEPS} {frame_steps} c_along mode vector "

@@ -474,7 +474,7 @@ def _checks(results: Sequence[Result]) -> str:
         "<h2>What must hold</h2><ul>"
         f"<li>grains lost in any run: {worst['grains_lost_n']:.0f}"
         "<li>the soil's momentum along the travel less what blade and floor gave it: at most "
-        f"{worst['momentum_share']:.1%} of the blade's push (forces are sampled every tenth step)"
+        f"{worst['momentum_share']:.1%} of the blade's push"
         f"<li>energy from nowhere between two frames: at most {worst['gained_share']:.2%} of the blade's work"
         f"<li>fastest grain {worst['pace_max_m_per_s']:.1f} m/s; neighbour lists made too late, by the engine's count: "
         f"{worst['dangerous_builds_n']:.0f}<li>median speed: {speed} million particle-steps a second and run</ul>"

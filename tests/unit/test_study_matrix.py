@@ -19,7 +19,7 @@ from graderd.studies.blade_rotation import cases as case_files
 from graderd.studies.blade_rotation import files, matrix, outcome, rule
 from graderd.studies.blade_rotation.case import FULL_SIZE, SCATTERED, Case, Sense, Work
 from graderd.studies.blade_rotation.engine import StudyError
-from graderd.studies.blade_rotation.lammps import FORCES, Motion
+from graderd.studies.blade_rotation.lammps import FORCES, PUSHED, TURNED, Motion
 from graderd.studies.blade_rotation.matrix import LOAD, QUICK, SPREAD
 from graderd.studies.blade_rotation.outcome import Frame
 from graderd.studies.blade_rotation.pile import F64
@@ -204,8 +204,9 @@ def test_what_a_killed_run_left_is_read_to_its_last_whole_frame(tmp_path: Path) 
     found = files.frames(tmp_path)
     assert list(found) == [0, 600, 1200]
     assert found[600][1, 1] == 9.0, "the later process counts from its first step on"
-    row = " ".join(["1.5"] * len(FORCES))
-    (tmp_path / "forces.0.0.txt").write_text(f"# head\n100 {row}\n200 {row}\n300 1.5 1")
+    for kind, columns in (("forces", PUSHED), ("moments", TURNED)):
+        row = " ".join(["1.5"] * len(columns))
+        (tmp_path / f"{kind}.0.0.txt").write_text(f"# head\n100 {row}\n200 {row}\n300 1.5 1")
     assert files.forces(tmp_path).shape == (2, len(FORCES))
     (tmp_path / "along.0.0.txt").write_text("# head\n600 2\n1 0\n2 5\n1200 2\n1 3\n")
     assert {step: list(row) for step, row in files.along(tmp_path).items()} == {600: [0.0, 5.0]}
