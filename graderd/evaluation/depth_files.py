@@ -36,16 +36,16 @@ _OF_EDGE = {"up": (0.0, -1.0, 0.0), "down": (0.0, 1.0, 0.0), "left": (-1.0, 0.0,
 class Lens(BaseModel):
     """The block ``depth`` of a frame set's ``camera.json``; its pose is not needed, the ground is found."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True)
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
-    width: Annotated[int, Field(gt=0)]
-    height: Annotated[int, Field(gt=0)]
+    width: Annotated[int, Field(gt=0, le=10_000)]
+    height: Annotated[int, Field(gt=0, le=10_000)]
     fx: Annotated[float, Field(gt=0)]
     fy: Annotated[float, Field(gt=0)]
     cx: float
     cy: float
     coeffs: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    scale_m: Annotated[float, Field(gt=0)] = 0.001
+    scale_m: Annotated[float, Field(gt=0, le=1)] = 0.001
     """Metres that one step of an integer picture stands for."""
 
     def rays(self) -> F64:
@@ -68,7 +68,8 @@ def find(folder: Path, pattern: str, where: str) -> list[Path]:
             (Path(given.anchor), str(given.relative_to(given.anchor))) if given.is_absolute() else (folder, pattern)
         )
         found = [path for path in base.glob(name) if path.is_file()]
-    except (ValueError, NotImplementedError, OSError) as error:  # the second is pathlib's word on an absolute pattern
+    # pathlib's words on what names no file: "/", ".", an absolute pattern
+    except (ValueError, LookupError, NotImplementedError, OSError) as error:
         raise ProtocolError(where, f"{pattern!r} is no name or pattern of files ({error})") from None
     if not found:
         raise DeviceMissingError(
@@ -144,7 +145,10 @@ class Reader:
             if frame.depth_mm is None or frame.depth_intrinsics is None:
                 continue
             told = frame.depth_intrinsics
-            lens = Lens(**{name: getattr(told, name) for name in Lens.model_fields if hasattr(told, name)})
+            try:
+                lens = Lens(**{name: getattr(told, name) for name in Lens.model_fields if hasattr(told, name)})
+            except ValidationError as error:
+                raise ProtocolError(str(path), f"its depth camera: {error.errors()[0]['msg']}") from None
             if lens not in self._recorded_rays:
                 self._recorded_rays[lens] = lens.rays()
             found.append(self._back_projected(path, frame.depth_mm, lens, self._recorded_rays[lens]))
@@ -200,7 +204,8 @@ def _pictures(path: Path) -> list[Any]:
             raise ProtocolError(str(path), "not a 16-bit grey PNG", "Depth is millimetres along the optical axis")
         return [picture]
     try:
-        array = np.load(path, allow_pickle=False)
+        # Mapped, not read: a heading that promises more than there is asks for no memory.
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
     except OSError as error:
         raise DeviceMissingError(str(path), f"cannot be read ({error.strerror or error})") from None
     except (ValueError, EOFError, SyntaxError) as error:

@@ -150,7 +150,7 @@ class _Work:
             raise DeviceMissingError(str(path), f"cannot be read ({error.strerror})") from None
         except UnicodeDecodeError:
             raise ProtocolError(str(path), "is not UTF-8 text", "Save it as CSV in UTF-8") from None
-        except ValueError as error:
+        except (ValueError, csv.Error) as error:
             raise ProtocolError(f"{path}:{rows.line_num}", f"{column}: {error}", "Newtons as plain numbers") from None
         if not loads or not np.isfinite(loads).all():
             raise ProtocolError(str(path), f"column {column} holds no finite loads", "Newtons as plain numbers")

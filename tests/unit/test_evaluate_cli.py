@@ -271,6 +271,9 @@ def test_a_bad_experiment_file_is_told_with_its_place(
         ("blind.npy", "blind.npy: no pixel has depth"),
         ("words.npy", "words.npy: holds no depth picture"),
         ("broken.npy", "broken.npy: not a NumPy file"),
+        ("huge.npy", "huge.npy: not a NumPy file"),
+        ("/", "'/' is no name or pattern of files"),
+        (".", "'.' is no name or pattern of files"),
         ("broken.ply", "broken.ply: not a PLY file"),
         ("broken.las", "broken.las: not a readable LAS file"),
         ("bare.npy", "heap, trial[1]: no soil is to be seen"),
@@ -286,6 +289,9 @@ def test_a_bad_scan_is_one_line(tmp_path: Path, after: str, complaint: str, caps
     np.save(tmp_path / "words.npy", np.array(["a", "b"]))
     np.save(tmp_path / "bare.npy", np.stack(camera(1).scans_mm(lambda x, _: 0.0 * x, 2)))
     np.save(tmp_path / "noise.npy", np.random.default_rng(1).integers(400, 2000, (240, 848)).astype(np.uint16))
+    huge = np.lib.format.header_data_from_array_1_0(np.zeros((1, 240, 848))) | {"shape": (1_000_000, 240, 848)}
+    with (tmp_path / "huge.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, huge)
     for name in ("broken.npy", "broken.ply", "broken.las"):
         (tmp_path / name).write_bytes(b"junk" * 20)
     assert run_app(["evaluate", str(one_trial(tmp_path, "t", f'after = ["{after}"]'))]) == 2
@@ -378,6 +384,29 @@ after = ["pass.mcap@4..9.5"]
     (folder / "pictures.toml").write_text(pictures)
     assert evaluated(folder / "pictures.toml", capsys) == found
     assert found["Flattening work", 15.0, "volume_moved_l"]["value"] > 1.0
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("width", 10**9), ("scale_m", 1e300), ("cx", float("nan")), ("fx", 0.0), ("height", "many")],
+)
+def test_a_camera_that_cannot_be_is_one_line(tmp_path: Path, capsys: Captured, key: str, value: object) -> None:
+    """A picture of 10^18 pixels was waited for, and metres of 10^300 were warned of."""
+    save(tmp_path, "heap", [], HALF_VIEW)
+    np.save(tmp_path / "scan.npy", np.ones((240, 848), np.uint16))
+    told = json.loads((tmp_path / "camera.json").read_text(encoding="utf-8"))
+    told["depth"][key] = value
+    (tmp_path / "camera.json").write_text(json.dumps(told), encoding="utf-8")
+    assert run_app(["evaluate", str(one_trial(tmp_path, "t", 'after = ["scan.npy"]'))]) == 2
+    said = capsys.readouterr().err
+    assert f"camera.json: depth.{key}: " in said
+    assert said.count("\n") == 1
+
+
+def test_a_load_that_is_no_table_is_one_line(tmp_path: Path, capsys: Captured) -> None:
+    (tmp_path / "long.csv").write_text('load_n\n"' + "1" * 200_000 + '"\n', encoding="utf-8")
+    assert run_app(["evaluate", str(one_trial(tmp_path, "t", 'load_csv = "long.csv"'))]) == 2
+    assert "long.csv:1: load_n: field larger" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
