@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import logging
 
+import pytest
+
+from graderd.runtime.app import journal
 from graderd.runtime.app.journal import BURST_N, RepeatFilter
 
 
@@ -72,3 +75,11 @@ def test_messages_that_are_all_different_fill_no_disk() -> None:
         log.say("camera: " + "".join(chr(97 + int(d)) for d in str(int(log.now_s * 10))))
         log.now_s += 0.1
     assert BURST_N <= len(log.told) <= BURST_N + 61
+
+
+def test_no_more_messages_are_remembered_than_so_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal, "KEYS_MOST_N", 3)
+    log = Log()
+    for message in "abcda":
+        log.say(f"camera: {message}")
+    assert [message[-1] for _, message in log.told] == ["a", "b", "c", "d", "a"]  # the first was forgotten meanwhile
