@@ -85,10 +85,11 @@ def socket_routes(
 
     @router.websocket("/bus/{name}")
     async def bus(socket: WebSocket, name: str) -> None:
+        name = printable(name)[:60]  # no bus is called otherwise, and whoever is told of it shows it
         try:
             texts = port.bus_text(name)
         except ServiceError as error:
-            problem = Problem(error=error.message, where=f"bus {printable(name)[:60]}", remedy=error.remedy)
+            problem = Problem(error=error.message, where=f"bus {name}", remedy=error.remedy)
             await answer(404, problem, socket.scope, socket.receive, socket.send)
             return
         await socket.accept()

@@ -65,6 +65,17 @@ async def test_a_bus_that_is_not_there_is_refused_with_those_that_are(tmp_path: 
         assert refused.value.status_code == 404
 
 
+@pytest.mark.parametrize("where", ["bus", "services"])
+async def test_a_name_of_control_characters_comes_back_printable(tmp_path: Path, where: str) -> None:
+    async with serving(tmp_path) as (_, path):
+        with pytest.raises(InvalidStatus) as refused:
+            async with connect(path, f"/v1/{where}/a%0ab%1b[2J"):
+                raise AssertionError("it was opened")
+    told = json.loads(refused.value.response.body or b"{}")
+    assert "a\\nb" in f"{told['where']} {told['error']}"
+    assert all(text.isprintable() for text in told.values() if isinstance(text, str))
+
+
 async def test_a_slow_client_gets_no_old_statuses_and_makes_nothing_grow(tmp_path: Path) -> None:
     async with serving(tmp_path, limits=ApiLimits(stream_max_hz=200.0)) as (daemon, path):
         reader, writer = await asyncio.open_unix_connection(str(path), limit=4096)

@@ -39,6 +39,7 @@ BODIES = {
     "deeply nested": b"[" * 8000,
     "a lone surrogate": b'{"reason": "\\ud800"}',
     "control characters": b'{"reason": "a\\nb\\u001b[2J"}',
+    "a field of control characters": b'{"a\\nb\\u001b[2J": 1}',
 }
 COMMANDS = {
     "reason is a number": b'{"command": "stop", "reason": 5}',
@@ -96,6 +97,7 @@ async def test_no_body_is_a_reason_to_refuse_a_stop(tmp_path: Path, body: bytes)
         assert (status_code, reply["accepted"]) == (200, True)
         assert daemon.state.mode is Mode.STOPPED
         assert daemon.state.reason.isprintable()
+        assert reply["message"].isprintable()
         assert 0 < len(daemon.state.reason) < 300
 
 
