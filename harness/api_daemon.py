@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
+import os
+import socket
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
@@ -35,6 +38,25 @@ from graderd.hal.settings import Finite, Settings
 from harness.awake_clock import AwakeClock
 
 T = TypeVar("T")
+
+_PORTS = itertools.count()
+
+
+def free_port() -> int:
+    """A port for a test's daemon; the one after it, which serves stops, is free as well.
+
+    Below those that the kernel gives to whoever connects, and by process: tests beside this one take neither.
+    """
+    while True:
+        port_n = 10_000 + os.getpid() % 100 * 200 + next(_PORTS) % 100 * 2
+        with socket.socket() as one, socket.socket() as other:
+            try:
+                one.bind(("127.0.0.1", port_n))
+                other.bind(("127.0.0.1", port_n + 1))
+            except OSError:
+                continue
+            return port_n
+
 
 TICK_S = 0.02
 SPEED_PER_S = {"rotation": 60.0, "lift_left": 200.0, "lift_right": 200.0, "tilt": 100.0}

@@ -81,8 +81,8 @@ RUNTIME: Final = (
     Mutant(
         "service-while-armed",
         "graderd/runtime/port.py",
-        "is not Mode.DISARMED:",
-        "is Mode.AUTO:",
+        "is not Mode.DISARMED or",
+        "is Mode.AUTO or",
         (PORT + "test_what_moves_or_unpowers_needs_consent_and_a_disarmed_machine",),
         "the servo is rebooted under a load in manual",
     ),

@@ -75,7 +75,7 @@ def decisive(case: Case, outcome: Outcome) -> str:
 
 
 async def make_ready(stack: Stack) -> None:
-    """Armed, manual, standing, without any fault: where every injection begins and where a recovery must lead."""
+    """Armed, manual, standing, and no fault but endured ones: where every injection begins and a recovery ends."""
     await stack.rest()
     end_s = time.monotonic() + 25.0
     while time.monotonic() < end_s:
@@ -83,9 +83,7 @@ async def make_ready(stack: Stack) -> None:
         if status is None:
             await asyncio.sleep(0.1)
             continue
-        faults = [
-            f["name"] for f in status["faults"] if f["name"] not in ("daemon.lease_lapsed", "daemon.tick_overrun")
-        ]
+        faults = [f["name"] for f in status["faults"] if f["name"] not in stack.endured]
         if status["mode"] == "stopped":
             await stack.command("reset")
         elif status["mode"] == "disarmed":

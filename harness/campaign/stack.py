@@ -78,6 +78,8 @@ class Stack:
         self.config_path = directory / "graderd.toml"
         self.log_path = directory / "daemon.log"
         self.status: JsonObject = {}
+        self.endured = {"daemon.lease_lapsed", "daemon.tick_overrun"}
+        """Faults beside which the machine is ready all the same: a busy computer shows them."""
         self.watch = Watch(directory / "control.sock")
         self._broken = broken
         self._rig: asyncio.subprocess.Process | None = None

@@ -95,6 +95,7 @@ async def _stop_while_the_disk_hangs(stack: Stack) -> None:
     """The recorder's thread waits for it in the kernel: ticks, stop and the end of the service do not."""
     assert (await stack.command("reset"))["accepted"]
     stack.hook(disk_stalled=1)
+    stack.endured.add("daemon.recorder_failed")
     status = await stack.until_status(
         lambda s: any(fault["name"] == "daemon.recorder_failed" for fault in s["faults"]), 20.0, "a hung disk not told"
     )

@@ -12,8 +12,7 @@ import httpx
 import pytest
 
 from graderd.api.settings import TcpSettings
-from harness.api_daemon import serving
-from tests.unit.test_api_tcp import free_port
+from harness.api_daemon import free_port, serving
 
 WEB = Path(str(files("graderd.web")))
 TEXTS = {path.name: path.read_text("utf-8") for path in WEB.iterdir() if path.suffix in (".html", ".css", ".js")}

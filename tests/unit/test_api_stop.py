@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import socket
 import time
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.api.stop_socket import stop_socket_beside
 from graderd.core.machine import Mode
 from graderd.tokens import Right, create_token
-from harness.api_daemon import serving, within
+from harness.api_daemon import free_port, serving, within
 from tests.unit.test_api_sockets import connect
 
 pytestmark = pytest.mark.live
@@ -256,13 +255,6 @@ async def test_the_stop_port_needs_the_token(tmp_path: Path) -> None:
             assert (await within(5, _read_answer(reader)))[0] == status_code
             writer.close()
         assert daemon.state.mode is Mode.STOPPED
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port_n: int = probe.getsockname()[1]
-        return port_n
 
 
 async def test_a_socket_file_that_is_taken_away_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,8 +20,7 @@ from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.api.stop_socket import OPEN_N, stop_socket_beside
 from graderd.core.machine import Mode
 from graderd.tokens import Right, create_token
-from harness.api_daemon import FakeDaemon, Hold, longest_hold, serving, within
-from tests.unit.test_api_tcp import free_port
+from harness.api_daemon import FakeDaemon, Hold, free_port, longest_hold, serving, within
 
 pytestmark = pytest.mark.live
 
@@ -50,7 +49,7 @@ class Case:
 CASES = {
     "TcpGuard: tokens": Case("wrong", 1000, frozenset({"401"})),
     "TcpGuard: Host and Origin": Case("foreign", 150, frozenset({"403"})),
-    "Limiter: body_max_bytes_n": Case("large", 100, frozenset({"413", "503", "closed"})),
+    "Limiter: body_max_bytes_n": Case("large", 100, frozenset({"413", "408", "503", "closed"})),
     "Limiter: body_timeout_s": Case("slow", 100, frozenset({"408", "closed"})),
     "connections_max_n": Case("idle", 500, frozenset({"closed"}), LIMITS.connections_max_n),
     "Limiter: websockets_max_n": Case("mute", 50, frozenset({"503"}), LIMITS.websockets_max_n),

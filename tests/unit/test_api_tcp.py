@@ -32,19 +32,12 @@ from graderd.core import commands as cmd
 from graderd.core.machine import Mode
 from graderd.hal.errors import DeviceError
 from graderd.tokens import Right, create_token, revoke_token
-from harness.api_daemon import FakeDaemon, longest_hold, serving, within
+from harness.api_daemon import FakeDaemon, free_port, longest_hold, serving, within
 
 pytestmark = pytest.mark.live
 
 HOLD_S = 0.05
 """What the interface may keep the tick waiting, in computing time: what else the machine does does not count."""
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def tcp_settings(tmp_path: Path, *allowed_hosts: str) -> TcpSettings:

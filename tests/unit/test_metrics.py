@@ -16,8 +16,7 @@ from graderd.core.soil import Zone
 from graderd.core.status import AheadStatus, AxisStatus, FaultStatus, SoilStatus, Status
 from graderd.hal.device import Lifecycle
 from graderd.tokens import Right, create_token
-from harness.api_daemon import FakeDaemon, serving
-from tests.unit.test_api_tcp import free_port
+from harness.api_daemon import FakeDaemon, free_port, serving
 
 UNITS = (
     "meters",

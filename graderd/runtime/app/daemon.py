@@ -203,7 +203,6 @@ class Daemon:
                 for task in tasks:
                     task.cancel()
         finally:
-            self._hang_watch.close()
             await self._close_devices()
             self._state_file.settle()
             # Not earlier: a second signal, taken the default way, would end the process before the wires are safe.
@@ -218,6 +217,8 @@ class Daemon:
         except Exception:
             self._devices.hold_all()
             raise
+        finally:
+            self._hang_watch.close()  # a helper may need longer than that to end, beside a disk that hangs
 
     def _helpers(self) -> dict[str, Callable[[], Coroutine[Any, Any, None]]]:
         """What may fail without a word to the blade, and is started again; what it fails to do is told as a fault."""
