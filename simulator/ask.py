@@ -34,6 +34,7 @@ def turn_by_hand(control: Path | str, angle_deg: float) -> None:
     for step_n in range(1, steps_n + 1):
         rig_request(control, "turn_blade", angle_deg=here_deg + (angle_deg - here_deg) * step_n / steps_n)
         time.sleep(HAND_S)
+    rig_request(control, "turn_blade", angle_deg=angle_deg)  # it rests there
 
 
 def _request(given: dict[str, Any]) -> dict[str, Any]:

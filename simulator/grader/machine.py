@@ -66,6 +66,8 @@ class ControlTimes:
 _ADDRESSES = {"lift_left": 19, "lift_right": 20, "tilt": 27}
 STOPS_DEG = 75.0
 """The blade's ends meet the machine's frame there, so that one that is pushed or runs away does not spin for ever."""
+_HAND_S = 0.1
+"""Where a hand was longer ago says nothing about how fast it turns the blade."""
 _LONGEST_STEP_S = 0.05
 """A process that was stopped for longer lets the machine miss that time instead of jumping."""
 _UNLOADED_LIFT_N = 150.0
@@ -92,6 +94,7 @@ class Machine:
             [self.lift_left, self.lift_right, self.tilt], link=None if can_bus else can_link, bus=can_bus
         )
         self._control_times = ControlTimes(_ADDRESSES, SystemClock())
+        self._hand = (float("-inf"), 0.0)
         self.servo_faults: dict[str, dict[str, float]] = {}
         self.actuator_faults: dict[str, dict[str, float]] = {}
 
@@ -167,7 +170,10 @@ class Machine:
             raise ValueError(f"the blade turns to {STOPS_DEG:g} degrees at most")
         if self.servo.torque_enabled:
             raise ValueError("the servo's torque holds the blade; disarm first")
-        self.servo.shaft_deg = angle_deg
+        now_s, (before_s, before_deg) = SystemClock().now_s(), self._hand
+        speed = (angle_deg - before_deg) / (now_s - before_s) if 0.0 < now_s - before_s < _HAND_S else 0.0
+        self.servo.turn_by_hand(angle_deg, speed)
+        self._hand = now_s, angle_deg
 
     def send_frame(self, can_id: int, data: bytes) -> None:
         """A message of some other node on the actuators' bus (29-bit identifier)."""

@@ -100,6 +100,11 @@ class ServoBody:
         self._publish()
         self.memory["goal_position"] = self.memory["present_position"]
 
+    def turn_by_hand(self, angle_deg: float, deg_per_s: float) -> None:
+        """Somebody turns the output shaft and has it there, at that speed: the encoder tells both."""
+        self.shaft_deg, self.plant.velocity_deg_per_s = angle_deg, deg_per_s
+        self._publish()
+
     @property
     def shaft_velocity_deg_per_s(self) -> float:
         """True angular velocity of the output."""
