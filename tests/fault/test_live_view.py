@@ -6,7 +6,6 @@ import asyncio
 import base64
 import json
 import math
-import socket
 import struct
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.typing import Subprotocol
 
 from graderd.simulator.control_client import RigControl
+from harness.api_daemon import free_port
 from tests.machine import PATIENT, Machine, machine
 
 pytestmark = pytest.mark.whole_machine
@@ -81,8 +81,7 @@ def view_process(grader: Machine) -> psutil.Process:
 
 
 async def test_a_viewer_sees_picture_thirds_blade_and_plots(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port_n = probe.getsockname()[1]
+    port_n = free_port()
     topics = {"/status", "/tf", "/camera/preview", "/soil/thirds"}
     async with machine(tmp_path, f"{PATIENT}\n[foxglove]\nport_n = {port_n}\n") as grader:
         await grader.until(lambda s: s.soil.ahead is not None and s.axes["rotation"].measured is not None)

@@ -11,7 +11,6 @@ import contextlib
 import json
 import os
 import re
-import socket
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
@@ -27,6 +26,7 @@ from graderd.client import RefusedError
 from graderd.core.machine import ARMED, Mode
 from graderd.simulator.control_client import RigControl
 from graderd.tokens import Right, create_token
+from harness.api_daemon import free_port
 from tests.machine import Served, standing_machine
 
 pytestmark = pytest.mark.whole_machine
@@ -122,8 +122,7 @@ class Watch:
 @pytest.fixture(scope="module")
 def described(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Described]:
     directory = tmp_path_factory.mktemp("interface")
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port_n = probe.getsockname()[1]
+    port_n = free_port()
     tokens = {right: create_token(directory / "tokens", right, right) for right in Right}
     with standing_machine(directory, SETTINGS.format(port_n=port_n, directory=directory)) as machine:
         yield Described(machine, port_n, tokens)

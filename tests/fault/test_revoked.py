@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from graderd.client import AsyncClient, ClientError
 from graderd.core.machine import Mode
 from graderd.simulator.control_client import RigControl
 from graderd.tokens import Right, create_token
+from harness.api_daemon import free_port
 from tests.machine import Served, standing_machine
 
 pytestmark = pytest.mark.whole_machine
@@ -54,8 +54,7 @@ def secured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Secured
         capture_output=True,
     )
     monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "certificate.pem"))
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port_n = probe.getsockname()[1]
+    port_n = free_port()
     token = create_token(tmp_path / "tokens", NAME, Right.COMMAND)
     with standing_machine(tmp_path, SETTINGS.format(port_n=port_n, directory=tmp_path)) as machine:
         yield Secured(machine, port_n, token)

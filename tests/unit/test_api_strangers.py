@@ -22,7 +22,7 @@ from graderd.core.machine import Mode
 from graderd.tokens import Right, create_token
 from harness.api_daemon import FakeDaemon, Hold, free_port, longest_hold, serving, within
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.whole_machine]
 
 LATE_S = 0.05
 """So much of the loop's time may they take in one go, computing; so late is a tick at most for their sake."""

@@ -190,6 +190,7 @@ async def test_it_says_at_once_what_it_cannot_do(tmp_path: Path, config: Path, c
         person.agrees = [False]
         assert "cancelled" in await refused()
         daemon.torque_on = True
+        await daemon.until(lambda: daemon.status().axes["rotation"].torque_on is True)
         assert "its torque is on" in await refused()
         await cli(path, "stop")
         assert "graderd is stopped" in await refused()

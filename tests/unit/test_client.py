@@ -28,7 +28,7 @@ from graderd.client import (
 )
 from graderd.core.machine import MachineSettings, Mode, Unmet
 from graderd.tokens import Right, create_token
-from harness.api_daemon import JPEG, FakeDaemon, serving
+from harness.api_daemon import JPEG, FakeDaemon, free_port, serving
 
 pytestmark = pytest.mark.live
 
@@ -295,9 +295,7 @@ def _two_ports() -> tuple[int, list[socket.socket]]:
 
 
 async def test_over_tcp_with_the_token_and_not_without(tmp_path: Path) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        tcp = TcpSettings(port_n=probe.getsockname()[1], token_file=tmp_path / "tokens")
+    tcp = TcpSettings(port_n=free_port(), token_file=tmp_path / "tokens")
     token = create_token(tcp.token_file, "test", Right.COMMAND)
     address = f"http://127.0.0.1:{tcp.port_n}"
     async with serving(tmp_path, tcp=tcp):

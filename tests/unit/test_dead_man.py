@@ -59,6 +59,14 @@ def test_what_a_frozen_connection_hands_over_holds_nothing() -> None:
     assert hand.held(7.02) is None
 
 
+def test_a_gap_that_a_busy_computer_makes_in_what_thaws_holds_nothing() -> None:
+    hand, now_s = HeldKey(), 7.0
+    for number in range(150):
+        now_s += 0.02 if number % 3 == 2 else 0.0005
+        hand.press("left", now_s)
+        assert hand.held(now_s) is None
+
+
 @given(st.lists(st.floats(0.0, 0.6), min_size=1, max_size=60), st.floats(0.0, 2.0))
 def test_nothing_is_held_longer_than_a_quarter_of_a_second(gaps_s: list[float], after_s: float) -> None:
     hand, now_s = HeldKey(), 10.0
