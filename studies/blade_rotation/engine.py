@@ -65,6 +65,12 @@ def dying(signal: str) -> list[str]:
     return [found, "--pdeathsig", signal] if found else []
 
 
+def environment() -> dict[str, str]:
+    """What the engine is started with: its wheel looks for MPI where a virtual environment has it only when told."""
+    libraries = f"{sys.prefix}/lib:{os.environ.get('LD_LIBRARY_PATH', '')}"
+    return {**os.environ, "LD_LIBRARY_PATH": libraries, "OMP_NUM_THREADS": "1"}
+
+
 def run(arguments: Sequence[str], folder: Path, log: str, progress: Progress | None = None) -> float:
     """Run an engine's command line in ``folder``; the wall time it took, s.
 
@@ -72,14 +78,9 @@ def run(arguments: Sequence[str], folder: Path, log: str, progress: Progress | N
         StudyError: it failed; the cause is its own last error line.
     """
     began = time.monotonic()
-    environment = {
-        **os.environ,
-        "LD_LIBRARY_PATH": f"{sys.prefix}/lib:{os.environ.get('LD_LIBRARY_PATH', '')}",
-        "OMP_NUM_THREADS": "1",
-    }
     with (folder / f"{log}.out").open("wb") as out:
         process = subprocess.Popen(
-            arguments, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT
+            arguments, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT
         )
         # Popen.wait with a timeout looks twenty times a second, which takes from the engine.
         ended = os.pidfd_open(process.pid)

