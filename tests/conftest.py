@@ -35,11 +35,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if UNIT in item.path.parents and not item.get_closest_marker("live"):
             item.add_marker("pure")
-        if item.get_closest_marker("whole_machine"):
-            # A machine in real time misses deadlines where others take the processors: once more, and told as a rerun.
+        else:
+            # What runs in real time misses deadlines where others take the processors: once more, and told as a rerun.
             item.add_marker(pytest.mark.flaky(reruns=1))
-            if not item.get_closest_marker("xdist_group"):
-                item.add_marker(pytest.mark.xdist_group("whole machine"))
+        if item.get_closest_marker("whole_machine") and not item.get_closest_marker("xdist_group"):
+            item.add_marker(pytest.mark.xdist_group("whole machine"))
         if isinstance(item, pytest.Function) and inspect.iscoroutinefunction(item.obj):
             item.fixturenames.insert(0, "no_leaked_tasks")
         group = item.get_closest_marker("xdist_group")
