@@ -26,6 +26,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 UNIT = Path(__file__).with_name("unit")
+RERUNS_MOST_N = 5
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -54,6 +55,14 @@ def pytest_collection_finish() -> None:
     event loop for 0.1 to 0.2 s. Daemon and rig do the same after their start."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """A run in which more than a few were made once more has failed: what fails often is no busy machine."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is not None and len(reporter.stats.get("rerun", ())) > RERUNS_MOST_N:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 @pytest.fixture
