@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import itertools
 import os
 import socket
@@ -59,6 +60,8 @@ def free_port() -> int:
 
 
 TICK_S = 0.02
+HOLD_S = 0.1
+"""So much may a client make the daemon compute in one go: half of the servo's watchdog, whatever machine this is."""
 SPEED_PER_S = {"rotation": 60.0, "lift_left": 200.0, "lift_right": 200.0, "tilt": 100.0}
 LIMITS = {"rotate": 60.0, "lift": 295.0, "tilt": 97.0, "height": 195.0, "slope": 20.0, "pitch": 14.0}
 
@@ -398,7 +401,9 @@ class Hold:
 
 @asynccontextmanager
 async def longest_hold() -> AsyncIterator[Hold]:
-    """Look from now on."""
+    """Look from now on. What earlier tests left behind is no garbage of the daemon's: it freezes its own start too."""
+    gc.collect()
+    gc.freeze()
     hold = Hold()
 
     async def look() -> None:
