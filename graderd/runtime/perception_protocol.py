@@ -8,6 +8,7 @@ To the child: first a :class:`Start`, then ``Angle`` at the control rate, ``Prev
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
@@ -24,7 +25,7 @@ _OBSERVATION: TypeAdapter[SoilObservation] = TypeAdapter(SoilObservation)
 
 
 class _Message(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Start(_Message):
@@ -129,9 +130,17 @@ class Observed(_Message):
             raise ValueError(f"confidence {observation.confidence} or shares {shares} are not between 0 and 1")
         if observation.ahead is not None and not 0.0 <= observation.ahead.confidence <= 1.0:
             raise ValueError(f"confidence {observation.ahead.confidence} of the soil ahead is not between 0 and 1")
-        if not math.isfinite(observation.capture_s):
-            raise ValueError(f"capture_s is {observation.capture_s}")
+        if not all(map(math.isfinite, _floats(asdict(observation)))):
+            raise ValueError("a number in it is not finite")
         return observation
+
+
+def _floats(content: dict[str, Any]) -> Iterator[float]:
+    for value in content.values():
+        if isinstance(value, float):
+            yield value
+        elif isinstance(value, dict):
+            yield from _floats(value)
 
 
 class CameraProblem(_Message):

@@ -57,6 +57,10 @@ COMPLAINTS_EVERY_S = 0.01
 COMPLAINTS_BYTES = 65_536
 COMPLAINTS_N = 20
 MAX_LINE_BYTES = 8 * 1024 * 1024
+MAX_WORDS_BYTES = 64 * 1024
+"""Of a message that is no picture: its texts are told to every client, at every tick."""
+MAX_KIND_AT = 64
+"""A message names its kind first."""
 MAX_UNSENT_BYTES = 64 * 1024
 
 log = logging.getLogger(__name__)
@@ -272,6 +276,7 @@ class PerceptionSupervisor:
 
     async def _one_line(self, lines: asyncio.StreamReader) -> bool:
         """Handle the child's next line. False: it ended, spoke nonsense or has been silent for too long."""
+        await asyncio.sleep(0)  # lines that wait already are read without a turn for anybody else
         silent_s = self._clock.now_s() - self._last_word_s
         try:
             async with asyncio.timeout(max(0.05, self._camera.restart_s - silent_s)):
@@ -286,6 +291,8 @@ class PerceptionSupervisor:
         if not line:
             return False
         try:
+            if len(line) > MAX_WORDS_BYTES and b'"preview"' not in line[:MAX_KIND_AT]:
+                raise ValueError(f"{len(line)} bytes that are no picture")
             message = FromChild.validate_json(line)
             self._last_word_s = self._clock.now_s()
             return self._take(message)
@@ -300,6 +307,8 @@ class PerceptionSupervisor:
             observation = message.unpack()
             if observation.capture_s > self._last_word_s + FUTURE_S:
                 raise ValueError(f"a frame of {observation.capture_s - self._last_word_s:.2f} s in the future")
+            if not self._is_news(observation):
+                return self._may_wait()
             self._newest, self._taken = observation, False
             self._no_frame_since_s = self._last_word_s
             self._frames_n += 1
@@ -315,10 +324,7 @@ class PerceptionSupervisor:
         elif isinstance(message, CameraProblem):
             log.warning("camera: %s", message.message, extra={**_FIELDS, "fault": f"camera.{message.condition}"})
             self._problem = message
-            # Alive but without frames for too long: the ladder goes on all the same. The time a child took to start
-            # does not count against it, or none that starts slowly would ever get to its first frame.
-            waiting_s = self._clock.now_s() - max(self._no_frame_since_s, self._opened_s)
-            return not message.final and waiting_s < self._camera.restart_s
+            return not message.final and self._may_wait()
         elif isinstance(message, Saved):
             if self._saved is not None and not self._saved.done():
                 self._saved.set_result(message)
@@ -327,6 +333,18 @@ class PerceptionSupervisor:
             if preview is not None and not preview.done():
                 preview.set_result(Reading(base64.b64decode(message.jpeg_base64), message.capture_s))
         return True
+
+    def _is_news(self, observation: SoilObservation) -> bool:
+        """Each picture counts once and none after a newer one, whatever order a child sends them in; one that is too
+        old to decide by when it comes is none."""
+        if self._last_word_s - observation.capture_s > self._camera.stale_s:
+            return False
+        return self._newest is None or observation.capture_s > self._newest.capture_s
+
+    def _may_wait(self) -> bool:
+        """Whether a child that is alive but without frames has time left: the ladder goes on all the same. The time it
+        took to start does not count against it, or none that starts slowly would ever get to its first frame."""
+        return self._clock.now_s() - max(self._no_frame_since_s, self._opened_s) < self._camera.restart_s
 
     async def _kill(self) -> None:
         """End the child, hung or not, and wait for it (a killed process is gone in milliseconds)."""

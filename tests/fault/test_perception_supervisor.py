@@ -30,8 +30,8 @@ def say(**message):
     sys.stdout.write(json.dumps(message) + "\\n"); sys.stdout.flush()
 def opened():
     say(kind="opened", description="fake camera", settings_read_back={"gain": 1.0}, not_kept=[])
-def frame(n=0, faults=()):
-    say(kind="observed", observation={"capture_s": time.monotonic(), "zone": "left", "confidence": 0.9,
+def frame(n=0, faults=(), old_s=0.0):
+    say(kind="observed", observation={"capture_s": time.monotonic() - old_s, "zone": "left", "confidence": 0.9,
         "reason": "", "frame_number": n, "faults": list(faults)})
 """
 
@@ -101,6 +101,72 @@ async def test_a_frame_that_has_grown_old_decides_nothing(tmp_path: Path) -> Non
         assert taken is not None
         assert taken.zone is Zone.UNKNOWN
         assert "old by now" in taken.reason
+
+
+async def test_a_picture_counts_once_and_not_after_a_newer_one(tmp_path: Path) -> None:
+    """What waited in a child, or is sent again by it, is no further vote for what was seen."""
+    body = (
+        'def at(n, capture_s):\n    say(kind="observed", observation={"capture_s": capture_s, "zone": "left", '
+        '"confidence": 0.9, "reason": "", "frame_number": n})\n'
+        "now = time.monotonic()\nopened()\nfor n in (3, 3, 2, 1, 3, 3):\n    at(n, now - 0.01 * (3 - n))\n"
+        'say(kind="opened", description="all sent", settings_read_back={}, not_kept=[])\nsignal.pause()\n'
+    )
+    patient = CAMERA.model_copy(update={"stale_s": 60.0, "restart_s": 120.0})
+    async with worker(tmp_path, body, patient) as eyes:
+        await until(lambda: eyes.status().description == "all sent")
+        assert eyes.newest is not None
+        assert (eyes.newest.frame_number, eyes.status().frames_n) == (3, 1)
+        assert eyes.take_observation() is not None
+        assert eyes.take_observation() is None
+
+
+async def test_a_child_that_sends_only_old_pictures_sends_none(tmp_path: Path) -> None:
+    """It is alive and talks, and nobody sees anything: the blade must not go on by what it was told before."""
+    body = "opened()\nframe()\nwhile True:\n    frame(old_s=1.0); time.sleep(0.03)\n"
+    async with worker(tmp_path, body) as eyes:
+        await until(lambda: eyes.newest is not None)
+        await until(lambda: "stale" in conditions(eyes))
+        assert eyes.take_observation() is None
+        await until(lambda: len(starts(tmp_path)) >= 2)
+
+
+async def test_a_child_that_talks_without_a_pause_leaves_the_others_their_turn(tmp_path: Path) -> None:
+    body = (
+        "opened()\nnow = time.monotonic()\n"
+        'line = \'{"kind": "observed", "observation": {"capture_s": %f, "zone": "none", "confidence": 0.9, '
+        '"reason": ""}}\\n\'\n'
+        'sys.stdout.write("".join(line % (now + n * 1e-6) for n in range(20000)))\n'
+        "sys.stdout.flush()\nsignal.pause()\n"
+    )
+    patient = CAMERA.model_copy(update={"stale_s": 60.0, "restart_s": 120.0})
+    async with worker(tmp_path, body, patient) as eyes:
+        most_n = before_n = 0
+        async with asyncio.timeout(DEADLINE_S):
+            while before_n < 20000:
+                await asyncio.sleep(0)
+                now_n = eyes.status().frames_n
+                most_n, before_n = max(most_n, now_n - before_n), now_n
+        assert most_n <= 2, "in one turn of the event loop: a tick that is due waits for all of them"
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        'kind="problem", condition="stale", message="x" * 200_000',
+        'kind="observed", observation={"capture_s": time.monotonic(), "zone": "left", "confidence": 0.9, "reason": "", '
+        '"faults": [{"condition": "dark", "detail": ""}] * 5000}',
+        'kind="observed", observation={"capture_s": time.monotonic(), "zone": "left", "confidence": 0.9, "reason": "", '
+        '"volume_left_l": float("nan")}',
+        'kind="preview", format={}, capture_s=float("inf"), jpeg_base64=""',
+    ],
+    ids=["long text", "many faults", "no number", "infinite"],
+)
+async def test_what_no_child_of_ours_says_ends_it_and_is_not_handed_on(tmp_path: Path, said: str) -> None:
+    """It would be told to every client, at every tick."""
+    async with worker(tmp_path, f"opened()\nsay({said})\nsignal.pause()\n") as eyes:
+        await until(lambda: "perception_nonsense" in conditions(eyes))
+        assert eyes.newest is None
+        assert all(len(fault.detail) < 1000 for fault in eyes.faults())
 
 
 async def test_frames_that_stop_are_unknown_at_once_and_the_child_is_replaced(tmp_path: Path) -> None:
