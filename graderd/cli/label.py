@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from graderd.cli.console import CliError, ExitCode, Json, example, print_json, print_text
+from graderd.cli.record import tell_gaps
 from graderd.core.soil import Zone
 from graderd.hal.errors import DeviceError, ProtocolError
 
@@ -80,10 +81,12 @@ def make_frame_set(source: Path, folder: Path, config: Path | None, blade_angle_
     if folder.exists():
         raise CliError(str(folder), "is there already", "name a folder that is not", ExitCode.USAGE)
     if source.suffix == ".mcap":
-        from graderd.record.export import export_frames
+        from graderd.record.export import export_frames, gaps_of
         from graderd.record.reader import Recording
 
-        if export_frames(Recording(source), folder) == 0:
+        recording = Recording(source)
+        tell_gaps(gaps_of(recording))
+        if export_frames(recording, folder) == 0:
             raise CliError(str(source), "holds no raw frames", "record with graderd record start --raw full")
         return
     _from_pictures(source, folder, config, blade_angle_deg)

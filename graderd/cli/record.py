@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
@@ -11,12 +12,23 @@ import typer
 
 from graderd import places
 from graderd.cli.asking import agree
-from graderd.cli.console import CliError, ExitCode, Json, client_of, example, print_json, print_table, print_text
+from graderd.cli.console import (
+    CliError,
+    ExitCode,
+    Json,
+    client_of,
+    error_line,
+    example,
+    print_json,
+    print_table,
+    print_text,
+)
 from graderd.client import NoDaemonError
 from graderd.hal.errors import DeviceError
 
 if TYPE_CHECKING:
     from graderd.config import Config
+    from graderd.record.layout import Gap
     from graderd.record.store import Entry, Store
 
 ConfigFile = Annotated[
@@ -43,16 +55,28 @@ def register(app: typer.Typer) -> None:
 
 def _reading(group: typer.Typer) -> None:
     @group.command("list", epilog=example("graderd record list", "graderd record list --json"))
-    def list_(context: typer.Context, config: ConfigFile = None, folder: Folder = None, json: Json = False) -> None:
+    def list_(
+        context: typer.Context,
+        verify: Annotated[
+            bool, typer.Option("--verify", help="Read all of each, and say where it is damaged.")
+        ] = False,
+        config: ConfigFile = None,
+        folder: Folder = None,
+        json: Json = False,
+    ) -> None:
         """List the recordings, newest last, and forecast how long the room lasts.
 
-        With --json it prints one object a recording.
+        With --json it prints one object a recording. --verify takes about a second for every hour that was recorded;
+        exit status 1 where something is damaged.
         """
         settings, store = _store(context, config, folder)
-        told = [(entry, told_of(entry)) for entry in store.entries()]
+        told = [(entry, told_of(entry, verify=verify)) for entry in store.entries()]
+        is_damaged = any(found["gaps"] for _, found in told)
         if json:
             for _, found in told:
                 print_json(found)
+            if is_damaged:
+                raise typer.Exit(ExitCode.FAILED)
             return
         rows = [
             (
@@ -60,7 +84,7 @@ def _reading(group: typer.Typer) -> None:
                 found["kind"],
                 f"{found['duration_s']:.0f} s" if found["duration_s"] is not None else "?",
                 f"{found['size_mb']:.1f} MB",
-                "" if found["ended"] else "no end: cut off, or being written",
+                state_of(found),
                 found["reason"],
             )
             for _, found in told
@@ -75,6 +99,13 @@ def _reading(group: typer.Typer) -> None:
             f"hour more ({forecast['raw_from']}), with one of {settings.recording.raw_every_n} about "
             f"{forecast['raw_mb_per_hour'] / settings.recording.raw_every_n:.0f}."
         )
+        for _, found in told:
+            for gap in found["gaps"]:
+                print_text(gap["text"])
+        if is_damaged:
+            raise typer.Exit(ExitCode.FAILED)
+        if not verify:
+            print_text("None was read through; --verify does, and says where one is damaged.")
 
     @group.command(epilog=example("graderd record export graderd-20260102T030405Z-000.mcap --to monday"))
     def export(
@@ -89,14 +120,17 @@ def _reading(group: typer.Typer) -> None:
         recording.mcap in the folder is the same recording with an end and an index, also where it was cut off.
         """
         from graderd.record.export import export as write
+        from graderd.record.export import gaps_of
 
-        path = path_of(context, file, config)
+        recording = _opened(path_of(context, file, config))
         try:
-            found = write(_opened(path), to)
+            found = write(recording, to)
         except FileExistsError:
             raise CliError(str(to), "is there already", "name a folder that is not", ExitCode.USAGE) from None
+        gaps = gaps_of(recording)
+        tell_gaps(gaps)
         if json:
-            print_json({"event": "exported", "folder": str(to), **found})
+            print_json({"event": "exported", "folder": str(to), **found, "gaps": [gap.model_dump() for gap in gaps]})
         else:
             parts = ", ".join(f"{number} {name.removesuffix('_n').replace('_', ' ')}" for name, number in found.items())
             print_text(f"{to}: {parts}")
@@ -168,8 +202,22 @@ def _running(group: typer.Typer) -> None:
             print_text("runs are recorded no more; the black box stays on")
 
 
-def told_of(entry: Entry) -> dict[str, Any]:
-    """What ``record list`` says of a file."""
+def tell_gaps(gaps: Iterable[Gap]) -> None:
+    """A line on stderr for each part of a recording that cannot be read."""
+    for gap in gaps:
+        typer.echo(error_line("", str(gap)), err=True)
+
+
+def state_of(told: dict[str, Any]) -> str:
+    """What is wrong with a file, for a line of the list."""
+    if told["problem"]:
+        return str(told["problem"])
+    damaged = f"damaged in {len(told['gaps'])} places" if told["gaps"] else ""
+    return ", ".join(filter(None, (damaged, "" if told["ended"] else "no end: cut off, or being written")))
+
+
+def told_of(entry: Entry, *, verify: bool = False) -> dict[str, Any]:
+    """What ``record list`` says of a file; ``verify``: read all of it."""
     from graderd.record.reader import Recording
 
     found: dict[str, Any] = {
@@ -186,6 +234,8 @@ def told_of(entry: Entry) -> dict[str, Any]:
         "gap_before": "",
         "every_n": "1",
         "problem": "",
+        "verified": verify,
+        "gaps": [],
     }
     try:
         recording = Recording(entry.path)
@@ -193,10 +243,12 @@ def told_of(entry: Entry) -> dict[str, Any]:
         return found | {"problem": error.cause}
     kept = ("started", "version", "config_sha256", "calibration_id", "reason", "gap_before", "every_n")
     extent = recording.extent
+    gaps = recording.gaps if verify else ()
     return (
         found
         | {name: recording.head[name] for name in kept if name in recording.head}
         | {"duration_s": round(extent.duration_s, 3), "ended": extent.is_ended}
+        | {"gaps": [{**gap.model_dump(), "text": str(gap)} for gap in gaps]}
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graderd.cli.console import CliError, ExitCode, Json, example, print_json, print_text
-from graderd.cli.record import path_of
+from graderd.cli.record import path_of, tell_gaps
 
 if TYPE_CHECKING:
     from graderd.record.replay import Check, Difference
@@ -50,8 +50,9 @@ def register(app: typer.Typer) -> None:
         """Put a recording through today's perception and tick, or play it to clients.
 
         --check: what was recorded goes in, raw frames included where there are some; what would have been sent, decided
-        or said otherwise is listed. Exit status 1 where something differs; with --config differences are what was asked
-        for.
+        or said otherwise is listed, and what could not be compared: where the recording is damaged, up to the next
+        memory. Exit status 1 where something differs, is damaged, or nothing could be compared; with --config
+        differences are what was asked for.
 
         --serve: the daemon's own interface, read only, until Ctrl-C. Look with `graderd --socket SOCKET status` or any
         other client; the services replay.play, replay.pause and replay.seek control it.
@@ -67,15 +68,26 @@ def register(app: typer.Typer) -> None:
 
 def _serve(path: Path, socket: Path, port: int | None, speed: float, from_s: float, as_json: bool) -> None:
     # Heavy imports wait until the command really runs.
+    from graderd.record.reader import Recording
     from graderd.runtime.app import serve_recording
+
+    recording = Recording(path)
+    tell_gaps(recording.gaps)
 
     def ready(duration_s: float) -> None:
         if as_json:
-            print_json({"event": "replay_ready", "socket": str(socket), "duration_s": duration_s})
+            print_json(
+                {
+                    "event": "replay_ready",
+                    "socket": str(socket),
+                    "duration_s": duration_s,
+                    "gaps_n": len(recording.gaps),
+                }
+            )
         else:
             print_text(f"{path.name}, {duration_s:.0f} s: graderd --socket {socket} status; Ctrl-C ends it")
 
-    serve_recording(path, socket, port, speed, from_s, ready)
+    serve_recording(recording, socket, port, speed, from_s, ready)
 
 
 def _check(path: Path, config: Path | None, as_json: bool) -> None:
@@ -92,6 +104,11 @@ def _check(path: Path, config: Path | None, as_json: bool) -> None:
     if as_json:
         for difference in found.differences:
             print_json({"event": "difference", **asdict(difference)})
+        for broken in found.breaks:
+            gap = broken.gap and broken.gap.model_dump()
+            print_json({"event": "not_compared", **asdict(replace(broken, gap=None)), "gap": gap})
+        for lacking in found.picture_gaps:
+            print_json({"event": "pictures_missing", "text": str(lacking), "gap": lacking.model_dump()})
         print_json(
             {
                 "event": "replay_finished",
@@ -99,12 +116,15 @@ def _check(path: Path, config: Path | None, as_json: bool) -> None:
                 "differences_n": len(found.differences),
                 "frames_n": found.frames_n,
                 "skipped_n": found.skipped_n,
+                "missing_n": sum(broken.missing_n or 0 for broken in found.breaks),
+                "breaks_n": len(found.breaks),
+                "damaged": found.is_damaged,
                 "warm_ups_n": found.warm_ups_n,
             }
         )
     else:
         _tell(found)
-    if found.differences and config is None:
+    if found.is_damaged or not found.ticks_n or (found.differences and config is None):
         raise typer.Exit(ExitCode.FAILED)
 
 
@@ -115,8 +135,20 @@ def _tell(found: Check) -> None:
         )
     if len(found.differences) > SHOWN_N:
         print_text(f"... and {len(found.differences) - SHOWN_N} more; --json prints all")
+    for broken in found.breaks[:SHOWN_N]:
+        missing = "nobody knows how many" if broken.missing_n is None else str(broken.missing_n)
+        again = "none after that could be" if broken.again_s is None else f"compared again from {broken.again_s:.3f} s"
+        print_text(f"{broken.text}; ticks missing: {missing}; {broken.skipped_n} more not compared, {again}")
+    if len(found.breaks) > SHOWN_N:
+        print_text(f"... and {len(found.breaks) - SHOWN_N} more such places; --json prints all")
+    for gap in found.picture_gaps:
+        print_text(f"{gap}; for the ticks of these pictures stands what was seen then")
     frames = f" and {found.frames_n} raw frames" if found.frames_n else ""
     print_text(f"{found.ticks_n} ticks{frames} decided again: {len(found.differences) or 'no'} differences")
+    if not found.ticks_n:
+        print_text(
+            "Nothing could be compared: after no memory of the tick that today's takes up did enough ticks follow"
+        )
     if found.warm_ups_n:
         print_text(
             f"The tick's memory is another version's: {found.skipped_n} ticks after each beginning were not judged"

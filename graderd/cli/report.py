@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from graderd.cli.console import CliError, ExitCode, Json, example, print_json, print_text
-from graderd.cli.record import path_of
+from graderd.cli.record import path_of, tell_gaps
 
 
 def register(app: typer.Typer) -> None:
@@ -42,7 +42,10 @@ def register(app: typer.Typer) -> None:
             "decisions_n": len(story.decisions),
             "faults_n": len(story.faults),
             "stops_n": len(story.stops),
+            "missing_s": round(story.missing_s, 3),
+            "gaps": [gap.model_dump() for gap in story.gaps],
         }
+        tell_gaps(story.gaps)
         if json:
             print_json({"event": "reported", **told})
         else:

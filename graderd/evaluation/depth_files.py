@@ -17,7 +17,7 @@ from graderd.evaluation.ground import F64
 from graderd.hal.camera import Intrinsics, StreamPose
 from graderd.hal.errors import DeviceMissingError, ProtocolError
 from graderd.perception.geometry import View
-from graderd.record.export import raw_frames
+from graderd.record.export import gaps_of, raw_frames
 from graderd.record.reader import Recording
 
 CAMERA = "camera.json"
@@ -137,7 +137,11 @@ class Reader:
         """The depth pictures among a recording's raw frames, by the lens that each came with."""
         found: list[Points] = []
         first_s: float | None = None
-        for judged in raw_frames(Recording(path)):
+        recording = Recording(path)
+        for gap in gaps_of(recording):
+            remedy = "Write out what is whole with graderd record export, and name the depth pictures that are meant"
+            raise ProtocolError(str(path), str(gap), remedy)
+        for judged in raw_frames(recording):
             frame = judged.frame
             first_s = frame.capture_s if first_s is None else first_s
             if span is not None and not span[0] <= frame.capture_s - first_s <= span[1]:

@@ -11,7 +11,7 @@ from typing import TextIO
 from graderd.perception.frame_set import Entry, FrameSetWriter, with_lens_of
 from graderd.record.files import RecordingFile
 from graderd.record.frames import Judged, judged_of
-from graderd.record.layout import COLOR, DEPTH, FRAME, LOG, PREVIEW, WIRE, Message
+from graderd.record.layout import COLOR, DEPTH, FRAME, GAP, LOG, PREVIEW, WIRE, Gap, Message
 from graderd.record.reader import Recording, as_written, new_folder, said
 from graderd.record.table import rows, write_csv
 
@@ -22,7 +22,7 @@ def export(recording: Recording, folder: Path) -> dict[str, int]:
     """Write everything that is in it to ``folder``; returns how much of each there was.
 
     ``recording.mcap`` is the same recording with an end and a summary, which every reader opens, also where the
-    original was cut off.
+    original was cut off; where something of it could not be read, a ``/gap`` says so.
 
     Raises:
         FileExistsError: the folder is there already.
@@ -65,25 +65,47 @@ def _log_line(message: Message) -> str:
 
 def raw_frames(recording: Recording) -> Iterator[Judged]:
     """The raw frames of a recording, whole ones only, oldest first: those that lie beside a run, or in it."""
-    for each in [Recording(path) for path in recording.frame_files] or [recording]:
+    for each in frame_recordings(recording):
         yield from _frames_in(each)
+
+
+def frame_recordings(recording: Recording) -> list[Recording]:
+    """Where its raw frames are: in files beside it, else in it."""
+    return [Recording(path) for path in recording.frame_files] or [recording]
+
+
+def gaps_of(recording: Recording) -> list[Gap]:
+    """What cannot be read of it and of its raw frames."""
+    beside = [Recording(path) for path in recording.frame_files]
+    return [gap for each in (recording, *beside) for gap in each.gaps]
 
 
 def _frames_in(recording: Recording) -> Iterator[Judged]:
     frame, color = b"", ""
-    waits_for_depth = False
-    for message in recording.messages((FRAME, COLOR, DEPTH)):
-        if message.topic == FRAME:
+    waits_for_depth = has_depth = False
+
+    def without_depth() -> Iterator[Judged]:
+        """What there is of a frame after which the file breaks off: whole, where there is never any depth."""
+        if waits_for_depth and not has_depth:
+            judged = judged_of(frame, color, None)
+            if judged.frame.depth_number < 0:
+                yield judged
+
+    for message in recording.messages((FRAME, COLOR, DEPTH, GAP)):
+        if message.topic == GAP:
+            yield from without_depth()
+            frame, waits_for_depth = b"", False
+        elif message.topic == FRAME:
             if waits_for_depth:
                 yield judged_of(frame, color, None)
             frame, waits_for_depth = message.data, False
-        elif message.topic == COLOR:
+        elif message.topic == COLOR and frame:
             color, waits_for_depth = said(message)["data"], True
         elif waits_for_depth:
+            has_depth = True
             yield judged_of(frame, color, said(message)["data"])
             waits_for_depth = False
-    if waits_for_depth:
-        yield judged_of(frame, color, None)
+    yield from without_depth()
 
 
 def export_frames(recording: Recording, folder: Path) -> int:

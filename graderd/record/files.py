@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,13 +53,15 @@ class _Output:
 
 
 class RecordingFile:
-    """One file. ``head`` says where it comes from; it and the configuration stand before everything else.
+    """One file. ``head`` says where it comes from; it and the configuration stand before everything else. ``topics``:
+    channels that are named in its first chunk; others are where they are first used, and without a summary nobody knows
+    what they are once that chunk is damaged.
 
     Every method that writes raises ``OSError``; then, and after :meth:`finish`, the file is closed and takes nothing
     more.
     """
 
-    def __init__(self, path: Path, head: Mapping[str, str], config_json: bytes) -> None:
+    def __init__(self, path: Path, head: Mapping[str, str], config_json: bytes, topics: Iterable[str] = ()) -> None:
         self.path = path
         self._output = _Output(path)
         output: Any = self._output
@@ -73,6 +75,8 @@ class RecordingFile:
         self._writer.add_metadata(METADATA, dict(head))
         self._writer.add_attachment(0, 0, CONFIG, "application/json", config_json)
         self.flush()
+        for topic in topics:
+            self._register(topic)
 
     @property
     def size_n(self) -> int:

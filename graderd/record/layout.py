@@ -17,6 +17,7 @@ import math
 import pickle
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from functools import cache, lru_cache
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, get_type_hints
@@ -50,6 +51,8 @@ SENSED: Final = "/sensed"
 TICK: Final = "/tick"
 MEMORY: Final = "/memory"
 MARK: Final = "/mark"
+GAP: Final = "/gap"
+"""In no file as the daemon writes it: readers put it where something cannot be read, and an export keeps it."""
 LOG: Final = "/log"
 TRANSFORM: Final = "/tf"
 PREVIEW: Final = "/camera/preview"
@@ -58,6 +61,9 @@ COLOR: Final = "/camera/color"
 DEPTH: Final = "/camera/depth"
 WIRE: Final = "/wire/"
 """With the wire's name: ``/wire/can``, ``/wire/servo``."""
+
+CHANNELS: Final = (SENSED, TICK, MEMORY, MARK, LOG, TRANSFORM, PREVIEW)
+"""Of every run and incident, beside the wires."""
 
 METADATA: Final = "graderd"
 CONFIG: Final = "config.json"
@@ -90,6 +96,40 @@ class Mark(BaseModel):
     text: str = ""
     client: str = ""
     lost_n: int = 0
+
+
+class Gap(BaseModel):
+    """A part of a file that cannot be read, between what can.
+
+    ``chunk_n``: which chunk of the file it is, or begins with, from 1. ``from_ns`` and ``to_ns``: when the last message
+    before it and the first one after it were logged; None where there is none, or nobody knows.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    file: str
+    chunk_n: int
+    first_byte_n: int
+    bytes_n: int
+    from_ns: int | None = None
+    to_ns: int | None = None
+
+    @property
+    def duration_s(self) -> float | None:
+        """How long it lasts; None: unknown."""
+        return None if self.from_ns is None or self.to_ns is None else (self.to_ns - self.from_ns) / 1e9
+
+    def __str__(self) -> str:
+        """For people."""
+        ends = [
+            f"{word} {datetime.fromtimestamp(at_ns / 1e9, UTC).strftime('%H:%M:%S.%f')[:-3]}"
+            for word, at_ns in (("after", self.from_ns), ("before", self.to_ns))
+            if at_ns is not None
+        ]
+        lasts = "" if self.duration_s is None else f" ({self.duration_s:.2f} s)"
+        where = f"chunk {self.chunk_n}, bytes {self.first_byte_n} to {self.first_byte_n + self.bytes_n}"
+        what = f"what was logged {' and '.join(ends)}{lasts}" if ends else "all there was"
+        return f"{self.file}: damaged in {where}: {what} cannot be read"
 
 
 class Wire(BaseModel):
@@ -470,6 +510,8 @@ def schema_of(topic: str) -> tuple[str, bytes]:
             name, schema = "graderd.Memory", plain_schema(Memory.model_json_schema(mode="serialization"), {})
         case "/mark":
             name, schema = "graderd.Mark", plain_schema(Mark.model_json_schema(), {})
+        case "/gap":
+            name, schema = "graderd.Gap", plain_schema(Gap.model_json_schema(), {})
         case _:
             raise ValueError(f"no channel {topic}")
     return name, json.dumps(schema).encode()

@@ -2,29 +2,42 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 import shutil
-from collections.abc import Collection, Iterator, Mapping
+import struct
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, Final
 
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Metadata
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Metadata
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import breakup_chunk, get_chunk_data_stream
 from mcap.summary import Summary
 from pydantic import ValidationError
 
 from graderd.config import Config, ConfigError
 from graderd.config.loader import explain
 from graderd.hal.errors import DeviceMissingError, ProtocolError
-from graderd.record.layout import CONFIG, FRAMES_SUFFIX, METADATA, SUFFIX, Message
+from graderd.record.layout import CONFIG, FRAMES_SUFFIX, GAP, METADATA, SUFFIX, Gap, Message
 
-RECORD_MOST_BYTES = 256 << 20
-"""A longer record is damage."""
+_MAGIC: Final = b"\x89MCAP0\r\n"
+_HEAD: Final = struct.Struct("<BQ")
+"""Before each record: what it is, and how many bytes follow."""
+_ZSTD: Final = struct.pack("<I", 4) + b"zstd"
+"""How graderd's chunks are compressed, as it stands in their head: they are found again by it."""
+_ZSTD_AT_N: Final = 37
+_CHUNK_HEAD_N: Final = 44
+"""Bytes of a chunk's record that are not its messages."""
+_SEARCHED_N: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +70,7 @@ class Recording:
             raise DeviceMissingError(str(path), "no such recording", "graderd record list shows which there are")
         self.head: Mapping[str, str] = {}
         self.config_json = b""
-        for record in self._records():
+        for _, record in self._records():
             if isinstance(record, Metadata) and record.name == METADATA:
                 self.head = record.metadata
             elif isinstance(record, Attachment) and record.name == CONFIG:
@@ -67,7 +80,12 @@ class Recording:
             if self.head and self.config_json:
                 break
         if not self.head or not self.config_json:
-            raise ProtocolError(str(path), "is no recording of graderd's, or broke off before it began")
+            cause = "is no recording of graderd's, or its head is damaged, or it broke off before it began"
+            raise ProtocolError(str(path), cause)
+        digest = hashlib.sha256(self.config_json).hexdigest()
+        if self.head.get("config_sha256", digest) != digest:
+            cause = "its head is damaged: the configuration in it is not the one that its hash is of"
+            raise ProtocolError(str(path), cause)
 
     @cached_property
     def config(self) -> Config:
@@ -102,13 +120,18 @@ class Recording:
         if summary is not None and summary.statistics is not None and summary.statistics.message_count:
             told = summary.statistics
             return Extent(told.message_start_time, told.message_end_time, told.message_count, True)
-        chunks = [record for record in self._records() if isinstance(record, Chunk)]
-        if chunks and not _inside(chunks[-1]):
-            chunks.pop()
-        if not chunks:
-            return Extent(None, None, 0, summary is not None)
-        first_ns = min(chunk.message_start_time for chunk in chunks)
-        return Extent(first_ns, max(chunk.message_end_time for chunk in chunks), None, summary is not None)
+        first_ns: int | None = None
+        last_ns: int | None = None
+        newest: Chunk | None = None
+        for _, record in self._records():
+            if not isinstance(record, Chunk):
+                continue
+            if newest is not None:
+                first_ns, last_ns = _wider(first_ns, last_ns, newest)
+            newest = record
+        if newest is not None and _messages_in(newest, {}) is not None:
+            first_ns, last_ns = _wider(first_ns, last_ns, newest)
+        return Extent(first_ns, last_ns, None if newest is not None else 0, summary is not None)
 
     @property
     def frame_files(self) -> list[Path]:
@@ -116,44 +139,180 @@ class Recording:
         stem = self.path.name.removesuffix(SUFFIX)
         return sorted(self.path.parent.glob(f"{stem}*{FRAMES_SUFFIX}"), key=lambda path: (len(path.name), path.name))
 
+    @cached_property
+    def gaps(self) -> tuple[Gap, ...]:
+        """What of it cannot be read, in its order; reads all of it. That it has no end is no gap."""
+        return tuple(Gap.model_validate_json(message.data) for message in self.messages((GAP,)))
+
     def messages(self, topics: Collection[str] | None = None, from_ns: int = 0) -> Iterator[Message]:
         """In the file's order, up to its last whole chunk; ``topics`` None: of all channels. ``from_ns``: not those
-        that were logged before."""
+        that were logged before.
+
+        Where something between two chunks, or before the end, cannot be read, a :class:`Gap` stands in its place, on
+        the channel of that name.
+        """
+        wants_gaps = topics is None or GAP in topics
         # Channels are named where they are first used: only who knows them beforehand may pass over a chunk.
-        names = self._channels if from_ns else {}
-        passes_over = bool(names)
-        for record in self._records():
-            if not isinstance(record, Chunk) or (passes_over and record.message_end_time < from_ns):
+        names = self._channels
+        passes_over = bool(names) and from_ns > 0
+        only_looks = bool(names) and topics is not None and set(topics) == {GAP} and GAP not in names.values()
+        chunk_n, last_ns = 0, None
+        lost: tuple[int, int] | None = None  # chunk and first byte of what could not be read
+        is_damaged, to_n = False, self.path.stat().st_size
+        for first_n, record in self._records():
+            if isinstance(record, Chunk):
+                chunk_n += 1
+                if passes_over and record.message_end_time < from_ns:
+                    last_ns, lost = record.message_end_time, None
+                    continue
+                found = _looked_at(record) if only_looks else _messages_in(record, names, all_named=is_damaged)
+                if found is not None:
+                    if lost is not None and wants_gaps:
+                        yield self._gap(lost, first_n, last_ns, record.message_start_time)
+                    lost, last_ns = None, record.message_end_time
+                    for topic, inner in found:
+                        if (topics is None or topic in topics) and inner.log_time >= from_ns:
+                            yield Message(topic, inner.log_time, inner.data)
+                    continue
+            elif record is None:
+                chunk_n += 1
+            else:
+                to_n = first_n if isinstance(record, DataEnd) else to_n
                 continue
-            for inner in _inside(record):
-                if isinstance(inner, Channel):
-                    names[inner.id] = inner.topic
-                elif isinstance(inner, McapMessage):
-                    topic = names.get(inner.channel_id)
-                    if topic is None:  # a channel that nobody named: whoever wrote this, it is no message of ours
-                        continue
-                    if (topics is None or topic in topics) and inner.log_time >= from_ns:
-                        yield Message(topic, inner.log_time, inner.data)
+            lost, is_damaged = lost or (chunk_n, first_n), True
+        if lost is not None and wants_gaps:
+            yield self._gap(lost, to_n, last_ns, None)
 
-    def _records(self) -> Iterator[Any]:
-        """Records up to the end or the first damage: a file that is being written ends anywhere, also in its last
-        chunk."""
+    def _gap(self, lost: tuple[int, int], to_n: int, from_ns: int | None, to_ns: int | None) -> Message:
+        chunk_n, first_n = lost
+        summary = self._summary if to_ns is None else None
+        if summary is not None and summary.statistics is not None:
+            to_ns = max(summary.statistics.message_end_time, from_ns or 0)
+        gap = Gap(
+            file=self.path.name,
+            chunk_n=chunk_n,
+            first_byte_n=first_n,
+            bytes_n=to_n - first_n,
+            from_ns=from_ns,
+            to_ns=to_ns,
+        )
+        return Message(GAP, from_ns or to_ns or 0, gap.model_dump_json().encode())
+
+    def _records(self) -> Iterator[tuple[int, Any]]:
+        """Records of ours, each with the byte it begins at, up to the end of the data. None: there no record begins
+        that graderd writes; what comes next is the next chunk that does."""
         with self.path.open("rb") as file:
-            try:
-                for record in StreamReader(file, emit_chunks=True, record_size_limit=RECORD_MOST_BYTES).records:
-                    if isinstance(record, DataEnd | Footer):
-                        return
-                    yield record
-            except Exception:  # the library has no one error for a record that is cut off or damaged
-                return
+            size_n = os.fstat(file.fileno()).st_size  # what is written meanwhile is another reading's
+            at_n = len(file.read(len(_MAGIC)))
+            while at_n + _HEAD.size <= size_n:
+                file.seek(at_n)
+                kind, length_n = _HEAD.unpack(file.read(_HEAD.size))
+                next_n = at_n + _HEAD.size + length_n
+                record = _record_of(kind, file.read(length_n)) if next_n <= size_n else None
+                if record is None:
+                    found_n = _next_chunk(file, at_n + 1, size_n)
+                    if found_n is None and next_n > size_n and kind in _READ and not self._has_end(file, size_n):
+                        return  # a file that was cut off, or is being written, ends within a record
+                    next_n = size_n if found_n is None else found_n
+                yield at_n, record
+                if isinstance(record, DataEnd):
+                    return
+                at_n = next_n
+
+    @staticmethod
+    def _has_end(file: BinaryIO, size_n: int) -> bool:
+        file.seek(max(0, size_n - len(_MAGIC)))
+        return file.read(len(_MAGIC)) == _MAGIC
 
 
-def _inside(chunk: Chunk) -> list[Any]:
-    """What is in a chunk; nothing where it is not whole."""
+def _skipped(stream: ReadDataStream) -> int:
+    """A record of which only its length counts: by channel, an index of the chunk before."""
+    stream.read2()
+    length_n = stream.read4()
+    if length_n and len(stream.read(length_n)) < length_n:
+        raise ValueError("longer than it is")
+    return length_n
+
+
+_READ: Final[Mapping[int, Callable[[ReadDataStream], Any]]] = {
+    Opcode.HEADER: Header.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.MESSAGE_INDEX: _skipped,
+    Opcode.DATA_END: DataEnd.read,
+}
+"""What graderd writes before a file's summary."""
+
+
+def _record_of(kind: int, body: bytes) -> Any:
+    """The record; None: it is none that graderd writes."""
+    stream = ReadDataStream(BytesIO(body))
     try:
-        return list(breakup_chunk(chunk, validate_crc=True))
+        record = _READ[kind](stream)
+    except Exception:  # the library has no one error for a record that is damaged
+        return None
+    return record if stream.count == len(body) else None
+
+
+def _next_chunk(file: BinaryIO, from_n: int, size_n: int) -> int | None:
+    """Where the next chunk begins that agrees with itself and is all there; None: there is none."""
+    file.seek(from_n)
+    base_n, window = from_n, b""
+    while piece := file.read(_SEARCHED_N):
+        window += piece
+        at = window.find(_ZSTD)
+        while at >= 0:
+            begins = at - _ZSTD_AT_N
+            if begins >= 0 and at + len(_ZSTD) + 8 <= len(window):
+                kind, length_n = _HEAD.unpack_from(window, begins)
+                (data_n,) = struct.unpack_from("<Q", window, at + len(_ZSTD))
+                ends_n = base_n + begins + _HEAD.size + length_n
+                if kind == Opcode.CHUNK and length_n == _CHUNK_HEAD_N + data_n and ends_n <= size_n:
+                    return base_n + begins
+            at = window.find(_ZSTD, at + 1)
+        kept_n = _ZSTD_AT_N + len(_ZSTD) + 8
+        base_n, window = base_n + max(0, len(window) - kept_n), window[-kept_n:]
+    return None
+
+
+def _wider(first_ns: int | None, last_ns: int | None, chunk: Chunk) -> tuple[int, int]:
+    start_ns, end_ns = chunk.message_start_time, chunk.message_end_time
+    return (
+        start_ns if first_ns is None else min(first_ns, start_ns),
+        end_ns if last_ns is None else max(last_ns, end_ns),
+    )
+
+
+def _looked_at(chunk: Chunk) -> list[tuple[str, McapMessage]] | None:
+    """Nothing of what is in a chunk; None: it is damaged."""
+    try:
+        get_chunk_data_stream(chunk, validate_crc=True)
     except Exception:  # as above
-        return []
+        return None
+    return []
+
+
+def _messages_in(
+    chunk: Chunk, names: dict[int, str], *, all_named: bool = False
+) -> list[tuple[str, McapMessage]] | None:
+    """Topics and messages in a chunk; None: it is damaged. ``names``: of the channels, by number; those that the chunk
+    names are put there. What nobody named is no message of ours, or (``all_named``) was named in what is lost."""
+    try:
+        records = breakup_chunk(chunk, validate_crc=True)
+    except Exception:  # as above
+        return None
+    found = []
+    for record in records:
+        if isinstance(record, Channel):
+            names[record.id] = record.topic
+        elif isinstance(record, McapMessage):
+            topic = names.get(record.channel_id)
+            if topic is not None:
+                found.append((topic, record))
+            elif all_named:
+                return None
+    return found
 
 
 def said(message: Message) -> dict[str, Any]:

@@ -36,6 +36,7 @@ from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.reading import Reading
 from graderd.record.files import RecordingFile
 from graderd.record.layout import (
+    CHANNELS,
     FRAMES_SUFFIX,
     INCIDENT_SUFFIX,
     LEVELS,
@@ -418,7 +419,7 @@ class _Files:
         }
         if self._gap:
             head["gap_before"] = self._gap
-        file = RecordingFile(self.store.new_path(now, suffix), head, self._config_json)
+        file = RecordingFile(self.store.new_path(now, suffix), head, self._config_json, CHANNELS)
         for number, message in enumerate(messages):
             file.add(message)
             if number % 20 == 19:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from graderd.config import Config
@@ -20,12 +20,14 @@ from graderd.core.soil import SoilObservation
 from graderd.core.tick import Controller, Sensed
 from graderd.hal.errors import ProtocolError
 from graderd.perception.classifier import judge_frame, make_classifier
-from graderd.record.export import raw_frames
+from graderd.record.export import frame_recordings, raw_frames
 from graderd.record.layout import (
+    GAP,
     MARK,
     MEMORY,
     SENSED,
     TICK,
+    Gap,
     Mark,
     Memory,
     Message,
@@ -71,14 +73,41 @@ class Difference:
 
 
 @dataclass(slots=True)
+class Break:
+    """Where ticks do not follow one another in the recording. What the tick had in mind is lost there: nothing is
+    judged before the next memory, from which everything is bit for bit again.
+
+    ``kind``: ``damaged`` (the file cannot be read there) or ``lost`` (the daemon did not keep up, and said so).
+    ``missing_n``: ticks that are not there, by the clock or as the daemon counted them; None: nobody knows.
+    ``skipped_n``: ticks that are there, and were not judged. ``again_s``: the tick (monotonic) from which on they are
+    judged again; None: none is. ``gap``: where in the file, of a damaged one.
+    """
+
+    kind: str
+    text: str
+    missing_n: int | None
+    gap: Gap | None = None
+    skipped_n: int = 0
+    again_s: float | None = None
+
+
+@dataclass(slots=True)
 class Check:
-    """What a check has found: ``ticks_n`` were decided again, ``skipped_n`` could not be (no memory to begin with)."""
+    """What a check has found: ``ticks_n`` were decided again, ``skipped_n`` could not be (no memory to begin with).
+    ``picture_gaps``: what of the raw frames cannot be read; there stands what was seen then."""
 
     ticks_n: int = 0
     skipped_n: int = 0
     frames_n: int = 0
     warm_ups_n: int = 0
     differences: tuple[Difference, ...] = ()
+    breaks: list[Break] = field(default_factory=list)
+    picture_gaps: tuple[Gap, ...] = ()
+
+    @property
+    def is_damaged(self) -> bool:
+        """Whether something of the recording could not be read."""
+        return bool(self.picture_gaps) or any(each.kind == "damaged" for each in self.breaks)
 
 
 def check(recording: Recording, config: Config | None = None) -> Check:
@@ -92,6 +121,8 @@ def check(recording: Recording, config: Config | None = None) -> Check:
     used = config or recording.config
     pictures, differences = _pictures(recording, used, found)
     differences += list(_merged(_decide(recording, used, found, pictures, follows=config is None)))
+    frames = [each for each in frame_recordings(recording) if each is not recording]
+    found.picture_gaps = tuple(gap for each in frames for gap in each.gaps)
     found.differences = tuple(sorted(differences, key=lambda difference: difference.order))
     return found
 
@@ -157,14 +188,23 @@ def _decide(
     knew = b""
     warm_until_s = float("-inf")
     cold = False
-    for message in recording.messages((SENSED, TICK, MEMORY, MARK)):
+    broken: list[Break] = []  # after which nothing was judged yet
+
+    def skipped() -> None:
+        found.skipped_n += 1
+        if broken:
+            broken[-1].skipped_n += 1
+
+    for message in recording.messages((SENSED, TICK, MEMORY, MARK, GAP)):
         if message.topic == SENSED:
             knew = message.data
-        elif message.topic == MARK:
+        elif message.topic in (MARK, GAP):
             with as_written(recording, message):
-                mark = Mark.model_validate_json(message.data)
-            if mark.kind == "lost":
-                controller = None
+                new = _break_at(message, config.control.tick_hz)
+            if new is not None:
+                found.breaks.append(new)
+                broken.append(new)
+                controller, knew = None, b""
         elif message.topic == MEMORY:
             if controller is not None and not follows:
                 continue
@@ -174,8 +214,8 @@ def _decide(
                 controller = controller_of(memory.controller, settings)
             except ValueError:
                 cold = controller is None
-        elif controller is None:
-            found.skipped_n += 1
+        elif controller is None or not knew:
+            skipped()
             if cold:  # the state of this tick is all there is to begin with
                 controller, cold = Controller(settings, _state(message.data)), False
                 with as_written(recording, message):
@@ -192,14 +232,27 @@ def _decide(
             sensed = _seen_today(sensed, pictures, config)
             told = tick_bytes(controller.step(sensed))
             if sensed.now_s < warm_until_s:
-                found.skipped_n += 1
+                skipped()
                 continue
             found.ticks_n += 1
+            for each in broken:
+                each.again_s = sensed.now_s
+            broken.clear()
             if told != message.data:
                 with as_written(recording, message):
                     some = list(_differences(said(message), json.loads(told), message.log_ns))
                 # Counters and ages began anew where the memory did.
                 yield from (each for each in some if not (found.warm_ups_n and each.kind == "other"))
+
+
+def _break_at(message: Message, tick_hz: float) -> Break | None:
+    """What a gap or mark says of missing ticks; None: nothing."""
+    if message.topic == GAP:
+        gap = Gap.model_validate_json(message.data)
+        missing_n = None if gap.duration_s is None else max(0, round(gap.duration_s * tick_hz) - 1)
+        return Break("damaged", str(gap), missing_n, gap)
+    mark = Mark.model_validate_json(message.data)
+    return Break("lost", f"not recorded: {mark.text}", mark.lost_n) if mark.kind == "lost" else None
 
 
 def _seen_today(sensed: Sensed, pictures: Mapping[int, SoilObservation], config: Config) -> Sensed:
@@ -302,7 +355,7 @@ def decided_again(recording: Recording) -> Iterator[Message]:
     Where the tick's memory is another version's, the first tick is kept as it was, and its state begun with.
 
     Raises:
-        ProtocolError: as :func:`check`.
+        ProtocolError: as :func:`check`, or ticks are missing in it.
     """
     settings = tick_settings(recording.config)
     pictures, _ = _pictures(recording, recording.config, Check())
@@ -326,6 +379,9 @@ def decided_again(recording: Recording) -> Iterator[Message]:
                     cold = True
                     continue
             yield message._replace(data=memory(told.now_s, controller))
+        elif message.topic in (MARK, GAP) and _break_at(message, recording.config.control.tick_hz) is not None:
+            cause = "ticks are missing in it, so that nobody knows what today would be decided after them"
+            raise ProtocolError(str(recording.path), cause, "Make a reference of a recording that is whole")
         elif message.topic == TICK and sensed is not None and controller is not None:
             yield message._replace(data=tick_bytes(controller.step(sensed)))
         elif message.topic == TICK and sensed is not None and cold:

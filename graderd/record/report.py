@@ -6,6 +6,7 @@ import base64
 import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from html import escape
 from pathlib import Path
 from typing import Any, Final
@@ -15,8 +16,8 @@ import numpy as np
 
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import catalogue_key
-from graderd.record.export import raw_frames
-from graderd.record.layout import MARK, PREVIEW, Mark
+from graderd.record.export import gaps_of, raw_frames
+from graderd.record.layout import MARK, PREVIEW, Gap, Mark
 from graderd.record.reader import Recording, as_written, new_folder, said
 from graderd.record.table import Row, rows, write_csv
 
@@ -67,10 +68,14 @@ class Decided:
 
 @dataclass(slots=True)
 class Story:
-    """What there is to tell of a recording."""
+    """What there is to tell of a recording. ``began_s``: its first tick, by the wall clock (epoch). ``missing_s``: how
+    long ticks are missing between others."""
 
+    began_s: float = 0.0
     duration_s: float = 0.0
     ticks_n: int = 0
+    missing_s: float = 0.0
+    gaps: list[Gap] = field(default_factory=list)
     modes: list[Span] = field(default_factory=list)
     faults: list[Span] = field(default_factory=list)
     decisions: list[Decided] = field(default_factory=list)
@@ -129,9 +134,14 @@ def _told(recording: Recording, story: Story) -> Iterator[Row]:
     open_faults: dict[str, Span] = {}
     decided: tuple[Any, Any] = (None, None)
     for row in rows(recording):
-        first_s = row["now_s"] if first_s is None else first_s
+        if first_s is None:
+            first_s = row["now_s"]
+            story.began_s = datetime.fromisoformat(row["wall_time"]).timestamp()
         at_s = row["now_s"] - first_s
         story.ticks_n += 1
+        if "missing_before_s" in row:  # nobody knows what was meanwhile
+            story.missing_s += row["missing_before_s"]
+            open_faults.clear()
         _mode(story, row, at_s)
         present = set(filter(None, row["faults"].split("; ")))
         for name in present - open_faults.keys():
@@ -155,11 +165,13 @@ def _told(recording: Recording, story: Story) -> Iterator[Row]:
 
 def _mode(story: Story, row: Row, at_s: float) -> None:
     last = story.modes[-1] if story.modes else None
-    if last is not None:
+    is_known = last is not None and "missing_before_s" not in row
+    if last is not None and is_known:
         last.to_s = at_s
-    if last is None or last.name != row["mode"]:
+    changed = last is None or last.name != row["mode"]
+    if changed or not is_known:
         story.modes.append(Span(row["mode"], at_s, at_s, row["reason"], row["wall_time"]))
-        if last is not None and row["mode"] in ("stopped", "disarmed"):
+        if changed and last is not None and row["mode"] in ("stopped", "disarmed"):
             story.stops.append(story.modes[-1])
 
 
@@ -173,6 +185,7 @@ def write(recording: Recording, folder: Path) -> Story:
     """
     with new_folder(folder):
         story, told = tell(recording)
+        story.gaps = gaps_of(recording)
         write_csv(folder / "ticks.csv", told)
         _add_pictures(recording, story)
         _table_csv(folder / "decisions.csv", _DECISION_COLUMNS, map(_decision_cells, story.decisions))
@@ -187,10 +200,9 @@ def write(recording: Recording, folder: Path) -> Story:
 
 def _add_pictures(recording: Recording, story: Story) -> None:
     """The nearest annotated picture and depth picture to each decision."""
-    first_ns = recording.extent.first_ns or 0
     nearest: dict[int, float] = {}
     for message in recording.messages((PREVIEW, MARK)):
-        at_s = (message.log_ns - first_ns) / 1e9
+        at_s = message.log_ns / 1e9 - story.began_s
         if message.topic == MARK:
             with as_written(recording, message):
                 mark = Mark.model_validate_json(message.data)
@@ -256,6 +268,7 @@ table{border-collapse:collapse}td,th{padding:.2em .8em .2em 0;text-align:left;ve
 th{font-weight:600;color:#5f6368}svg{width:100%;height:auto}.note{color:#5f6368}
 .decision{display:grid;grid-template-columns:15em 1fr 1fr;gap:1em;margin:1em 0;align-items:start}
 .decision img{width:100%;border-radius:4px}.big{font-size:1.3em;font-weight:600}
+.missing{border-left:4px solid #c8403a;padding-left:.6em}
 """
 
 
@@ -277,8 +290,10 @@ def page(recording: Recording, story: Story) -> str:
                 "configuration": head.get("config_sha256", "")[:16],
                 "calibration": head.get("calibration_id", ""),
                 **({"missing before": head["gap_before"]} if "gap_before" in head else {}),
+                **({"missing within": f"{_duration(story.missing_s)}, in no sum below"} if story.missing_s else {}),
             }
         ),
+        *(f"<p class=missing>{escape(str(gap))}</p>" for gap in story.gaps),
         "<h2>Modes</h2>",
         _strip(story),
         _rows(

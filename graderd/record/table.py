@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from graderd.core.axes import AXES, UNITS
-from graderd.record.layout import SENSED, TICK
+from graderd.record.layout import GAP, MARK, SENSED, TICK
 from graderd.record.reader import Recording, as_written, said
 
 Row = Mapping[str, Any]
@@ -30,29 +30,38 @@ COLUMNS: Final = (
     "wall_time", "now_s", "mode", "reason", "zone", "confidence", "left_l", "center_l", "right_l",
     "ahead_zone", "ahead_confidence", "ahead_left_l", "ahead_center_l", "ahead_right_l", "decision", "decision_deg",
     "speed_m_per_s", "travelled_m", "torque_nm", "temperature_c", *AXIS_COLUMNS, "faults", "commands",
+    "missing_before_s",
 )  # fmt: skip
 
 
 def rows(recording: Recording) -> Iterator[Row]:
-    """Every tick, oldest first; what was not known is absent.
+    """Every tick, oldest first; what was not known is absent. ``missing_before_s``: where ticks before it are missing,
+    how long it is since the last one.
 
     Raises:
         ProtocolError: a message is not as graderd writes it.
     """
     sensed: dict[str, Any] = {}
-    for message in recording.messages((SENSED, TICK)):
-        row = None
+    last_ns: int | None = None
+    breaks = False
+    for message in recording.messages((SENSED, TICK, MARK, GAP)):
+        row: dict[str, Any] | None = None
         with as_written(recording, message):
             told = said(message)
             if message.topic == SENSED:
                 sensed = told
+            elif message.topic != TICK:
+                breaks = breaks or message.topic == GAP or told["kind"] == "lost"
             elif sensed.get("now_s") == told.get("now_s"):
                 row = _row(message.log_ns, sensed, told)
+                if breaks and last_ns is not None:
+                    row["missing_before_s"] = round((message.log_ns - last_ns) / 1e9, 3)
+                last_ns, breaks = message.log_ns, False
         if row is not None:
             yield row
 
 
-def _row(log_ns: int, sensed: dict[str, Any], tick: dict[str, Any]) -> Row:
+def _row(log_ns: int, sensed: dict[str, Any], tick: dict[str, Any]) -> dict[str, Any]:
     state, soil, vehicle = tick["state"], tick.get("soil", {}), sensed.get("vehicle", {})
     decision = state.get("decision", {})
     rotation = sensed["axes"].get("rotation", {}).get("telemetry", {})

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from graderd.config import Config
+    from graderd.record.reader import Recording
 
 
 def run_daemon(
@@ -36,12 +37,12 @@ def run_guard(config_path: Path | None) -> int:
 
 
 def serve_recording(
-    path: Path, socket: Path, port_n: int | None, speed: float, from_s: float, ready: Callable[[float], None]
+    recording: Recording, socket: Path, port_n: int | None, speed: float, from_s: float, ready: Callable[[float], None]
 ) -> None:
     """See :func:`graderd.runtime.app.replay_server.serve_recording`."""
     from graderd.runtime.app.replay_server import serve_recording as run
 
-    run(path, socket, port_n, speed, from_s, ready)
+    run(recording, socket, port_n, speed, from_s, ready)
 
 
 def problems(config: Config) -> list[str]:

@@ -28,12 +28,12 @@ from graderd.config import Config
 from graderd.config.tick import tick_settings
 from graderd.core.axes import AxisFigures
 from graderd.core.commands import Command, Reply, Stop
-from graderd.core.status import CameraStatus, Status
+from graderd.core.status import CameraStatus, FaultStatus, Status
 from graderd.core.tick import Sensed, Tick
 from graderd.hal.device import DeviceService, NoArguments
 from graderd.hal.errors import DeviceError, ProtocolError
 from graderd.hal.settings import Finite, Settings
-from graderd.record.layout import PREVIEW, SENSED, TICK, WIRE, sensed_of, tick_of
+from graderd.record.layout import GAP, PREVIEW, SENSED, TICK, WIRE, Gap, sensed_of, tick_of
 from graderd.record.reader import Recording, said
 from graderd.runtime.status import build_status
 
@@ -92,13 +92,14 @@ class Player:
         """
         self._recording = recording
         self._config: Config = recording.config
-        extent = recording.extent
+        extent, self._gaps = recording.extent, [gap.model_dump() for gap in recording.gaps]
         if extent.first_ns is None:
             raise ProtocolError(str(recording.path), "nothing is in it")
         self._first_ns = extent.first_ns
         self.duration_s = extent.duration_s
         self._speed = speed
         self._paused = False
+        self._gap: Gap | None = None
         self._jump_s: float | None = from_s
         self._begun_n = 0
         self._figures = tick_settings(self._config).figures
@@ -145,12 +146,15 @@ class Player:
 
     async def _play(self, from_ns: int) -> None:
         """To the end, or to a jump."""
-        topics = (SENSED, TICK, PREVIEW, *(WIRE + name for name in WIRES))
+        topics = (SENSED, TICK, GAP, PREVIEW, *(WIRE + name for name in WIRES))
         knew, clock_s, clock_ns, first = b"", time.monotonic(), from_ns, True
         self._eyes.captures_s.clear()
+        self._gap = None
         for message in self._recording.messages(topics, from_ns):
             if message.topic == SENSED:
                 knew = message.data
+            elif message.topic == GAP:
+                self._gap, knew = Gap.model_validate_json(message.data), b""
             elif message.topic == PREVIEW:
                 self._picture = base64.b64decode(said(message)["data"]), message.log_ns / 1e9
             elif message.topic.startswith(WIRE):
@@ -169,6 +173,7 @@ class Player:
                             await self._changed.wait()
                             # Paused, sped up or sent elsewhere: what was due is due anew from here.
                             clock_s, clock_ns = time.monotonic(), self._at_ns
+                self._gap = None
                 self._show(knew, message.data, message.log_ns)
                 self._begun_n += first
                 first = False
@@ -188,8 +193,9 @@ class Player:
         loop: Any = self._loop
         eyes: Any = self._eyes
         wall = datetime.fromtimestamp(self._at_ns / 1e9, UTC).isoformat(timespec="milliseconds")
-        version = self._recording.head.get("version", "")
-        return build_status(self._config, loop, eyes).model_copy(update={"wall_time": wall, "version": version})
+        told = build_status(self._config, loop, eyes)
+        told = told.model_copy(update={"wall_time": wall, "version": self._recording.head.get("version", "")})
+        return told if self._gap is None else told.model_copy(update={"faults": (_missing(self._gap), *told.faults)})
 
     async def next_status(self, after_s: float) -> Status:  # noqa: ARG002  (the port's)
         """The next tick that is shown; ``after_s`` does not count: a recording also goes back."""
@@ -267,7 +273,8 @@ class Player:
 
     def _where(self) -> dict[str, Any]:
         at_s = (self._at_ns - self._first_ns) / 1e9
-        return {"at_s": at_s, "duration_s": self.duration_s, "speed": self._speed, "paused": self._paused}
+        stands = {"at_s": at_s, "duration_s": self.duration_s, "speed": self._speed, "paused": self._paused}
+        return {**stands, "in_gap": self._gap is not None, "gaps": self._gaps}
 
     async def service(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """Run one of them."""
@@ -282,15 +289,29 @@ class Player:
         return await service.run(wanted)
 
 
+def _missing(gap: Gap) -> FaultStatus:
+    """What clients are shown while what they see is older than where the playing is."""
+    return FaultStatus(
+        name="recording.damaged",
+        reads="The recording cannot be read here: what is shown is from before",
+        detail=str(gap),
+        remedy="It goes on after the gap",
+        reaction="warn",
+        clears="when gone",
+        age_s=0.0,
+        present=True,
+    )
+
+
 def serve_recording(
-    path: Path, socket: Path, port_n: int | None, speed: float, from_s: float, ready: Callable[[float], None]
+    recording: Recording, socket: Path, port_n: int | None, speed: float, from_s: float, ready: Callable[[float], None]
 ) -> None:
     """Serve a recording until SIGINT or SIGTERM; ``ready`` is told its length once clients are answered.
 
     Raises:
         ConfigError, DeviceError: it cannot be played, or not served.
     """
-    player = Player(Recording(path), speed, from_s)
+    player = Player(recording, speed, from_s)
     tcp = None if port_n is None else TcpSettings(port_n=port_n)
 
     async def run() -> None:
