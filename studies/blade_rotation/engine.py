@@ -1,11 +1,17 @@
-"""LAMMPS as a subprocess of its own for every run: a crash, a leak or a licence of the engine stays on its side."""
+"""LAMMPS as a subprocess of its own for every run: a crash, a leak or a licence of the engine stays on its side.
+
+It runs in the background: whatever else wants the processor has it first. A study takes hours, and a machine that
+computes one may be driving a blade.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import select
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -14,6 +20,8 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
+BACKGROUND_NICE = 19
+"""The least claim on a processor that is not idle's own."""
 LOOK_S = 1.0
 TAIL_BYTES = 4096
 STEP = re.compile(rb"^ *(\d+) +[-+.\deE]+ +[-+.\deE]+ +\d+ *$", re.MULTILINE)
@@ -80,8 +88,15 @@ def run(arguments: Sequence[str], folder: Path, log: str, progress: Progress | N
     began = time.monotonic()
     with (folder / f"{log}.out").open("wb") as out:
         process = subprocess.Popen(
-            arguments, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT
+            arguments,
+            cwd=folder,
+            env=environment(),
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
         )
+        _to_the_background(process.pid)
         # Popen.wait with a timeout looks twenty times a second, which takes from the engine.
         ended = os.pidfd_open(process.pid)
         try:
@@ -90,11 +105,21 @@ def run(arguments: Sequence[str], folder: Path, log: str, progress: Progress | N
                     progress(int(steps[-1]))
         finally:
             os.close(ended)
-            process.kill()  # nothing, where it has ended
+            # With its ranks: what a terminal sends to all it started does not reach a session of its own.
+            os.killpg(process.pid, signal.SIGKILL)
             process.wait()
     if process.returncode:
         raise StudyError(str(folder / log), _why(folder, log, process.returncode), "Look at the end of that file")
     return time.monotonic() - began
+
+
+def _to_the_background(session: int) -> None:
+    """Give a session's processes the least claim. Where Linux groups processes by session (``sched(7)``, autogroup), a
+    process's own niceness counts inside its session alone, and the session's counts outside."""
+    with contextlib.suppress(OSError):  # it has ended already
+        os.setpriority(os.PRIO_PGRP, session, BACKGROUND_NICE)
+    with contextlib.suppress(OSError):  # or a kernel without
+        Path(f"/proc/{session}/autogroup").write_text(str(BACKGROUND_NICE), encoding="ascii")
 
 
 def dangerous_builds(log: str) -> int:
