@@ -223,7 +223,7 @@ class ServoTask:
     """Keeps one servo in the state it should be in, poll by poll, whatever the wire does.
 
     ``torque_is_ours``: torque was switched on by us.
-    ``turn``: held by whoever has several exchanges to make that belong together.
+    ``wire_lock``: held by whoever has several exchanges to make that belong together.
     """
 
     def __init__(

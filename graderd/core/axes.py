@@ -20,7 +20,8 @@ UNITS: Final = MappingProxyType({"rotation": "deg"} | dict.fromkeys(ACTUATORS, "
 PARTS: Final = MappingProxyType({"rotation": "rotation", "lift_left": "lift", "lift_right": "lift", "tilt": "tilt"})
 """What of the blade an axis moves: a fault that holds one lift holds both."""
 
-_FIELDS: Final = {"rotation": "rotation_deg"} | {name: f"{name}_mm" for name in ACTUATORS}
+FIELDS: Final = MappingProxyType({"rotation": "rotation_deg"} | {name: f"{name}_mm" for name in ACTUATORS})
+"""The field that holds an axis's value in :class:`Goals` and :class:`Pose`, and in what is written of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +53,7 @@ class _ByAxis:
     tilt_mm: float | None = None
 
     def __getitem__(self, axis: str) -> float | None:
-        value: float | None = getattr(self, _FIELDS[axis])
+        value: float | None = getattr(self, FIELDS[axis])
         return value
 
     def items(self) -> tuple[tuple[str, float | None], ...]:
@@ -67,7 +68,7 @@ class _ByAxis:
     @classmethod
     def of(cls, **values: float | None) -> Self:
         """From values by axis name: ``Goals.of(rotation=30.0)``."""
-        return cls(**{_FIELDS[axis]: value for axis, value in values.items()})
+        return cls(**{FIELDS[axis]: value for axis, value in values.items()})
 
 
 @dataclass(frozen=True, slots=True)

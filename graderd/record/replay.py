@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from graderd.config import Config
 from graderd.config.tick import tick_settings
-from graderd.core.axes import AXES, UNITS
+from graderd.core.axes import AXES, FIELDS, UNITS
 from graderd.core.machine import State
 from graderd.core.soil import SoilObservation
 from graderd.core.tick import Controller, Sensed
@@ -281,7 +281,7 @@ def _differences(was: dict[str, Any], now: dict[str, Any], log_ns: int) -> Itera
         if before.get("send") == after.get("send") and before.get("hold") == after.get("hold"):
             continue
         any_told = True
-        measured = now["pose"].get(_POSE[axis])
+        measured = now["pose"].get(FIELDS[axis])
         verb = "turned" if axis == "rotation" else "moved"
         recorded, today = _order(before, axis), _order(after, axis)
         text = f"{axis}: {recorded} was sent, today {today}"
@@ -309,14 +309,6 @@ def _differences(was: dict[str, Any], now: dict[str, Any], log_ns: int) -> Itera
         places = [key for key in {**was, **now} if was.get(key) != now.get(key)]
         where = ", ".join(sorted(places)) or "the order of fields"
         yield told("other", "tick", 0.0, "", "", f"other words or numbers in {where}")
-
-
-_POSE: Final = {
-    "rotation": "rotation_deg",
-    "lift_left": "lift_left_mm",
-    "lift_right": "lift_right_mm",
-    "tilt": "tilt_mm",
-}
 
 
 def _order(axis: Mapping[str, Any], name: str) -> str:

@@ -45,7 +45,7 @@ TIMEOUT_S = 15.0
 """Deadline of waits: long, because the machine may be busy; nothing is measured by it."""
 RENEW_S = 0.02
 FRESH_S = 0.4
-"""As old as a reading may be for the control tick (``control.actuator_max_age_s``)."""
+"""As old as a reading may be for the control tick (``max_age_s`` of an actuator)."""
 
 
 class AxisStand(ABC):

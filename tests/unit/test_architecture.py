@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -51,3 +53,52 @@ def test_rooms_of_the_page_are_folders() -> None:
         assert (PROJECT / room).is_dir(), room
     for room in re.findall(r"^  (\w+)/", listing, re.MULTILINE):
         assert (PROJECT / "graderd" / room).is_dir() or (PROJECT / "drivers" / room).is_dir(), room
+
+
+ROOMS = {
+    "core": {"graderd.core", "graderd.hal", "numpy", "pydantic"},
+    "hal": {"graderd.hal", "numpy", "pydantic"},
+}
+"""What the rooms that compute may import beside the standard library; a contract of import-linter can only forbid."""
+NOT_PURE = {"asyncio", "datetime", "os", "random", "secrets", "socket", "subprocess", "threading", "time"}
+CLOCKS = {("hal", "time")}
+"""``hal/clock.py`` is the one clock."""
+
+
+def imported(path: Path) -> set[str]:
+    """The modules that a file imports, wherever in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return found
+
+
+def within(name: str, rooms: set[str]) -> bool:
+    return any(name == room or name.startswith(f"{room}.") for room in rooms)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_core_and_hal_import_what_computes_and_nothing_else(room: str) -> None:
+    pure = sys.stdlib_module_names - NOT_PURE
+    wrong = {
+        (path.name, name)
+        for path in (PROJECT / "graderd" / room).rglob("*.py")
+        for name in imported(path)
+        if name.partition(".")[0] not in pure and not within(name, ROOMS[room])
+    }
+    assert {(room, name) for _, name in wrong} <= CLOCKS
+    assert {name for name, _ in wrong} <= {"clock.py"}
+
+
+def test_drivers_import_of_graderd_the_contracts_and_the_facts_of_devices() -> None:
+    theirs = {"graderd.hal", "graderd.drivers", "graderd.firmware_profiles"}
+    wrong = {
+        (path.name, name)
+        for path in (PROJECT / "drivers").rglob("*.py")
+        for name in imported(path)
+        if within(name, {"graderd"}) and not within(name, theirs)
+    }
+    assert wrong == set()

@@ -313,24 +313,37 @@ def test_an_old_speed_is_none(age_s: float, since_m: float | None) -> None:
 
 def test_nobody_but_the_tick_calls_what_it_decides_with() -> None:
     deciding = {
-        "step",
-        "pass_gate",
-        "update_faults",
-        "clear_faults",
-        "LiftCoordinator",
-        "requirements",
-        "decide",
-        "resolve",
+        "machine": {"step"},
+        "gate": {"pass_gate"},
+        "faults.monitor": {"update_faults", "clear_faults"},
+        "lift_pair": {"LiftCoordinator"},
+        "readiness": {"requirements"},
+        "rule": {"decide", "interrupted"},
+        "motion": {"resolve"},
+        "plausibility": {"PlausibilityMonitor"},
     }
+    theirs = {name: f"graderd.core.{module}" for module, names in deciding.items() for name in names}
     root = Path(graderd.__file__).parent
-    importers = Counter[str]()
+    callers: dict[str, set[str]] = {}
     for path in root.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("graderd.core."):
-                taken = deciding & {alias.name for alias in node.names}
-                if taken - ({"decide"} if path.name == "machine.py" else set()):
-                    importers[path.relative_to(root).as_posix()] += 1
-    assert set(importers) == {"core/tick.py"}
+        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        froms = [node for node in nodes if isinstance(node, ast.ImportFrom)]
+        taken = {alias.name for node in froms for alias in node.names if theirs.get(alias.name) == node.module}
+        whole = {alias.asname or alias.name for node in froms for alias in node.names} | {
+            alias.asname or alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names
+        }
+        taken |= {
+            node.attr
+            for node in nodes
+            if isinstance(node, ast.Attribute)
+            and node.attr in theirs
+            and ast.unparse(node.value) in whole
+            and ast.unparse(node.value).rpartition(".")[2] == theirs[node.attr].rpartition(".")[2]
+        }
+        if taken:
+            callers[path.relative_to(root).as_posix()] = taken
+    of_the_machine = {"decide", "interrupted"}
+    assert callers == {"core/machine.py": of_the_machine, "core/tick.py": theirs.keys() - of_the_machine}
 
 
 def main() -> None:

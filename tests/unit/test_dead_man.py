@@ -137,13 +137,13 @@ def test_the_bytes_of_an_event_device_and_its_unplugging(tmp_path: Path) -> None
     fifo = tmp_path / "event0"
     os.mkfifo(fifo)
     pad = Pad(fifo)
-    keeper = os.open(fifo, os.O_RDWR)
+    other_end = os.open(fifo, os.O_RDWR)
     assert "shoulder" in pad.open()
     for kind, code, value in ((EV_ABS, ABS_X, 32767), (EV_KEY, BTN_TL, 1), (EV_SYN, 0, 0)):
-        os.write(keeper, EVENT.pack(100, 5000, kind, code, value))
+        os.write(other_end, EVENT.pack(100, 5000, kind, code, value))
     assert pad.wants(50.0) == "right"
     assert pad.wants(50.5) == "right"
-    os.close(keeper)  # pulled
+    os.close(other_end)  # pulled
     assert pad.wants(50.6) is None
     assert pad.wants(50.7) is None
     assert "No such file" in Pad(tmp_path / "nothing").open()

@@ -50,3 +50,11 @@ def test_the_newest_release_of_the_changelog_is_the_version() -> None:
         r"^## (\d+\.\d+\.\d+) - \d{4}-\d\d-\d\d$", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE
     )
     assert releases[0] == version
+
+
+def test_each_decision_has_a_number_of_its_own_and_says_it() -> None:
+    decisions = sorted((ROOT / "docs" / "adr").glob("*.md"))
+    numbers = [path.name.partition("-")[0] for path in decisions]
+    assert len(set(numbers)) == len(numbers), "two decisions with one number"
+    for path, number in zip(decisions, numbers, strict=True):
+        assert re.match(rf"# 0*{int(number)}\b", path.read_text(encoding="utf-8")), path.name

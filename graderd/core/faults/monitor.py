@@ -1,4 +1,5 @@
-"""Faults: how severe, how long until they count, and what clears them. The rows themselves: ``fault_catalogue``."""
+"""Faults: how severe, how long until they count, and what clears them. The rows themselves:
+:mod:`graderd.core.faults.catalogue`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """The perception child: owns the camera, judges every frame, can be killed at any moment without harm.
 
-Run by the daemon as ``python -m graderd.runtime.app.perception_child``; speaks ``worker_protocol`` on stdin and stdout.
+Run by the daemon as ``python -m graderd.runtime.app.perception_child``; speaks
+:mod:`graderd.runtime.perception_protocol` on stdin and stdout.
 """
 
 from __future__ import annotations

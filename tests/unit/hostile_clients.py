@@ -1,4 +1,4 @@
-"""What an interface on TCP must bear, as a process: ``python -m tests.unit.strangers PORT TOKEN KIND N LEFT``.
+"""What an interface on TCP must bear, as a process: ``python -m tests.unit.hostile_clients PORT TOKEN KIND N LEFT``.
 
 KIND, N times each:
 ``wrong``: requests with a token of their own making. ``foreign``: the right TOKEN from a foreign Origin or Host.

@@ -89,7 +89,7 @@ async def test_strangers_are_refused_and_stop_is_answered(
         async with longest_hold() as hold:
             words = (case.port(tcp), token, case.kind, case.number_n, case.left_n)
             strangers = await asyncio.create_subprocess_exec(
-                *("nice", sys.executable, "-m", "tests.unit.strangers", *map(str, words)),
+                *("nice", sys.executable, "-m", "tests.unit.hostile_clients", *map(str, words)),
                 stdout=asyncio.subprocess.PIPE,
             )
             assert strangers.stdout is not None
