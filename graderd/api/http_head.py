@@ -13,6 +13,7 @@ HEAD_MAX_BYTES = 8192
 """Request line and headers."""
 LINE_BYTES = 256
 """So much of a request is kept to know its first line by, should the rest of its head not be valid."""
+VERSIONS = (b"1.0", b"1.1")
 
 
 class JudgedConnection(h11.Connection):
@@ -41,6 +42,8 @@ class JudgedConnection(h11.Connection):
         """
         event = super().next_event()
         if isinstance(event, h11.Request):
+            if event.http_version not in VERSIONS:  # h11 takes any that has the form of one
+                raise h11.RemoteProtocolError("no version of HTTP that is spoken here")
             size_n = len(event.target) + sum(len(name) + len(value) + 4 for name, value in event.headers)
             if size_n > HEAD_MAX_BYTES:
                 raise h11.RemoteProtocolError("too long a head", error_status_hint=431)

@@ -7,6 +7,7 @@ every replay. ``graderd.runtime.control`` senses, calls and acts; status, DM1, r
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -344,7 +345,10 @@ def _pose_of(sensed: Sensed, figures: Mapping[str, AxisFigures]) -> Pose:
 
 
 def _fresh(reading: Reading[float] | None, now_s: float, max_age_s: float) -> float | None:
-    return reading.value if reading is not None and reading.is_fresh(now_s, max_age_s) else None
+    """Its value; None where it is old, or no number: a distance that is none would never end a pass."""
+    if reading is None or not reading.is_fresh(now_s, max_age_s) or not math.isfinite(reading.value):
+        return None
+    return reading.value
 
 
 def _samples(sensed: Sensed) -> Iterator[AxisSample]:

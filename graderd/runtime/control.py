@@ -123,6 +123,7 @@ class ControlLoop:
         interrupts = self.tick.state.mode in ARMED
         self._keep_last_stop = not interrupts
         self.stop_now(cmd.Stop(reason=reason))
+        self._keep_last_stop = False  # a stop while the devices are being closed is somebody's, and needs its reset
         return interrupts
 
     # ---- the tick -------------------------------------------------------------------------------------------------

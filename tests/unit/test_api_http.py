@@ -131,11 +131,14 @@ async def test_a_body_that_never_ends_is_given_up(tmp_path: Path) -> None:
         await writer.wait_closed()
 
 
-async def test_what_is_no_http_is_told_so_and_fills_no_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("said", [b"what is this", b"GET / HTTP/9.9", b"GET /v1/status HTTP/2.0"])
+async def test_what_is_no_http_is_told_so_and_fills_no_log(
+    said: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     async with serving(tmp_path) as (_, path):
         for _ in range(5):
             reader, writer = await asyncio.open_unix_connection(str(path))
-            writer.write(b"what is this\r\n\r\n")
+            writer.write(said + b"\r\n\r\n")
             answer = await within(5, reader.read())
             assert answer.startswith(b"HTTP/1.1 400 ")
             assert json.loads(answer.partition(b"\r\n\r\n")[2])["where"] == "request"

@@ -136,6 +136,15 @@ async def test_an_ordinary_restart_keeps_the_last_stop(bench: Bench, tmp_path: P
     assert Bench(tmp_path).loop.last_stop == last
 
 
+async def test_a_stop_while_the_daemon_ends_needs_its_reset_after_the_restart(bench: Bench, tmp_path: Path) -> None:
+    assert bench.loop.end("SIGTERM received") is False  # not armed: the restart itself asks for no reset
+    bench.loop.stop_now(cmd.Stop(reason="dog on the site", client="cab"))
+    assert bench.state_file.settle()
+    again = Bench(tmp_path)
+    assert again.loop.tick.state.mode is Mode.STOPPED
+    assert "dog on the site (by cab)" in again.loop.tick.state.reason
+
+
 async def test_after_a_stop_and_a_restart_reset_comes_first(bench: Bench, tmp_path: Path) -> None:
     await bench.arm()
     bench.loop.stop_now(cmd.Stop(reason="dog on the site", client="cab"))
