@@ -60,8 +60,8 @@ def free_port() -> int:
 
 
 TICK_S = 0.02
-HOLD_S = 0.1
-"""So much may a client make the daemon compute in one go: half of the servo's watchdog, whatever machine this is."""
+HOLD_S = 0.05
+"""So much may a client make the daemon compute in one go, and so late a tick be for its sake at most."""
 SPEED_PER_S = {"rotation": 60.0, "lift_left": 200.0, "lift_right": 200.0, "tilt": 100.0}
 LIMITS = {"rotate": 60.0, "lift": 295.0, "tilt": 97.0, "height": 195.0, "slope": 20.0, "pitch": 14.0}
 

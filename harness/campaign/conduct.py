@@ -199,6 +199,9 @@ async def general(stack: Stack, case: Case, phase: Phase, outcome: Outcome) -> N
         await asyncio.sleep(STILL_S)
         from_s = time.monotonic()
         await demand(stack, case.needs)
+    if case.hidden_by and phase is Phase.LIFTING:
+        await stack.until(lambda: not stack.watch.moving((case.hidden_by,)), 10.0, "the lifts do not come to rest")
+        from_s = time.monotonic()
     await detect(stack, case, outcome, from_s)
     await react(stack, case, outcome, from_s, before)
     await recover(stack, case, outcome, before)

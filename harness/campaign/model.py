@@ -76,12 +76,14 @@ class Case:
     """One fault of the table.
 
     ``faults``: names the daemon may give it; the first decides what must happen. With ``either`` the one that the
-    daemon gave decides: each is as true, and which comes first depends on where the axes are. ``needs``: the axis that
-    has to be commanded for the fault to show; in a phase where it is not, it is commanded after the injection and
-    times count from there. ``detect_s``: promised time to detection. ``own_motion``: axes the fault itself moves, which
-    no software can stop. ``repair``: takes the cause away. ``before_arm``: what the remedy asks a person to do first.
-    ``log_errors``: error lines of the daemon's log that belong to the fault. ``conduct``: how it is run where the
-    general way does not fit (the daemon itself dies, say). ``short``: phases of the shortened campaign.
+    daemon gave decides: each is as true, and which comes first depends on where the axes are. ``needs``: the axis
+    that has to be commanded for the fault to show; in a phase where it is not, it is commanded after the injection
+    and times count from there. ``detect_s``: promised time to detection. ``own_motion``: axes the fault itself
+    moves, which no software can stop. ``hidden_by``: an axis whose lift hides the fault, because the drive makes up
+    for it; times count from where that axis stands. ``repair``: takes the cause away. ``before_arm``: what the
+    remedy asks of a person first. ``log_errors``: error lines of the daemon's log that belong to the fault.
+    ``conduct``: how it is run where the general way does not fit (the daemon itself dies, say). ``short``: phases
+    of the shortened campaign.
     """
 
     name: str
@@ -95,6 +97,7 @@ class Case:
     recover_s: float = 12.0
     stand_s: float | None = None
     own_motion: frozenset[str] = NONE
+    hidden_by: str = ""
     before_arm: Action | None = None
     log_errors: tuple[str, ...] = ()
     conduct: Conduct | None = None

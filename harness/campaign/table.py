@@ -255,9 +255,8 @@ ACTUATOR = (
               detect_s=0.8),
     _actuator("stuck", "is stuck", "lift_left", "overload not_moving", "stuck",
               needs="lift", detect_s=1.6, short=(LIFTING,)),
-    # While it is driven, the drive makes up for what its load does: it shows once the lift has come to its end.
-    _actuator("drift", "is moved by its load", "lift_right", "uncommanded_motion backdrive", "drift", detect_s=4.0,
-              own_motion=frozenset({"lift_right"})),
+    _actuator("drift", "is moved by its load", "lift_right", "uncommanded_motion backdrive", "drift", detect_s=2.5,
+              own_motion=frozenset({"lift_right"}), hidden_by="lift_left"),
     _actuator("override", "is moved by its manual override", "tilt", "uncommanded_motion", "manual_override",
               inject=override_tilt, detect_s=2.0, before_arm=turn_tilt_back, own_motion=frozenset({"tilt"})),
     _actuator("overload", "carries 4000 N", "lift_left", "overload", "overload", inject=overload_lift, needs="lift",

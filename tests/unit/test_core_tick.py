@@ -295,15 +295,20 @@ async def test_each_device_is_asked_once_a_tick_and_readiness_is_made_once(
     await loop._power.close()
 
 
-@pytest.mark.parametrize(("age_s", "since_m"), [(0.1, 0.0), (0.6, None)])
-def test_an_old_speed_is_none(age_s: float, since_m: float | None) -> None:
+@pytest.mark.parametrize(
+    ("age_s", "travelled_m", "since_m"),
+    [(0.1, 7.0, 0.0), (0.6, 7.0, None), (0.1, math.nan, None), (0.1, math.inf, None)],
+)
+def test_an_old_speed_is_none_and_so_is_a_distance_that_is_no_number(
+    age_s: float, travelled_m: float, since_m: float | None
+) -> None:
     """Then the time counts, not the travel."""
     controller, step = Controller(SETTINGS), partial(Sensed, powered=True)
     controller.step(Sensed(1.0, standing(1.0, HOME, Lifecycle.STANDBY), commands=(cmd.Arm(),)))
     for number in range(1, 50):
         now_s = 1.0 + TICK_S * number
         seen = SoilObservation(now_s, Zone.LEFT, 0.9, "", 0.8, 0.15, 0.05)
-        vehicle = VehicleTelemetry(Reading(0.5, now_s - age_s), Reading(7.0, now_s - age_s))
+        vehicle = VehicleTelemetry(Reading(0.5, now_s - age_s), Reading(travelled_m, now_s - age_s))
         commands = (cmd.Auto(),) if number == 2 else ()
         tick = controller.step(step(now_s, standing(now_s, HOME), commands=commands, observation=seen, vehicle=vehicle))
         if tick.state.decision.zone is not None:
