@@ -24,17 +24,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGINT)
         raise  # not reached
+    except OSError as error:
+        sys.exit(_unsaid(error))
     sys.exit(_all_said(status))
 
 
 def _all_said(status: int) -> int:
-    """The exit status once what was printed has gone out. Where its reader has gone or its disk is full, the
-    interpreter, which would tell of it with a traceback, has nothing left to write."""
+    """The exit status once what was printed has gone out."""
     try:
         sys.stdout.flush()
         return status
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):
-            sys.stderr.write(f"graderd: standard output: {error.strerror}. Look at where it goes\n")
-        return status or 1
+        return _unsaid(error, status)
+
+
+def _unsaid(error: OSError, status: int = 0) -> int:
+    """The exit status where the reader of what was printed has gone or its disk is full. The interpreter, which would
+    tell of it with a traceback, or a second time, has nothing left to write."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if not isinstance(error, BrokenPipeError):
+        sys.stderr.write(f"graderd: standard output: {error.strerror}. Look at where it goes\n")
+    return status or 1

@@ -105,6 +105,7 @@ def run_app(arguments: list[str]) -> int:
 
     Raises:
         KeyboardInterrupt: Ctrl-C.
+        OSError: there is nowhere to print to.
     """
     as_json = "--json" in arguments
     try:
@@ -131,12 +132,10 @@ def run_app(arguments: list[str]) -> int:
         return ExitCode.FAILED
     except BrokenPipeError:
         return ExitCode.FAILED
-    except OSError as error:  # a file or directory that this user may not use, or nowhere to print to
-        if error.filename is None:
-            print_error("standard output", error.strerror or str(error), "look at where it goes", as_json=False)
-        else:
-            where = str(error.filename)
-            print_error(where, error.strerror or str(error), "Run it as a user who may use it", as_json)
+    except OSError as error:  # a file or directory that this user may not use
+        if error.filename is None:  # nowhere to print to
+            raise
+        print_error(str(error.filename), error.strerror or str(error), "Run it as a user who may use it", as_json)
         return ExitCode.FAILED
     if result == INTERRUPTED:
         raise KeyboardInterrupt

@@ -34,7 +34,10 @@ def register(app: typer.Typer) -> None:
         )
     )
     def classify(
-        source: Annotated[Path, typer.Argument(help="Picture, folder of pictures, video, recording or frame set.")],
+        source: Annotated[
+            Path,
+            typer.Argument(readable=False, help="Picture, folder of pictures, video, recording or frame set."),
+        ],
         method: Annotated[
             Method | None, typer.Option(help="Default: depth where the source has it, else fast_color.")
         ] = None,
