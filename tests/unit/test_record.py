@@ -652,6 +652,8 @@ async def test_a_recorder_that_is_started_again_writes_with_one_thread(
     disk.released.set()
     with pytest.raises(ValueError, match="no such picture"):
         await again
+    async with asyncio.timeout(10.0):  # a busy machine's thread may take longer than the run waits for it
+        await work.recorder._thread_ended.wait()
     assert all(Recording(path).extent.is_ended for path in work.paths("run"))
 
 
