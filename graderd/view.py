@@ -19,6 +19,11 @@ LEAST_COLUMNS_N: Final = 60
 LEAST_LINES_N: Final = 20
 NARROW_N: Final = 80
 BADLY: Final = ("stop", "disarm")
+BARS: Final = "▁▂▃▄▅▆▇█"
+LEVEL: Final = "·"
+UNSEEN: Final = "?"
+TALL_MM: Final = 100.0
+"""A profile's bars are as tall as its highest, which is told beside them; one lower than this looks low."""
 MARK: Final = "…"
 STYLES: Final[Mapping[Kind, str]] = {
     "title": "bold",
@@ -71,6 +76,21 @@ def fitting(text: str, columns_n: int) -> str:
 def number(value: float | None, unit: str, digits: int = 1) -> str:
     """``12.3 deg``; what is not known is a dash, and never a number."""
     return "-" if value is None else f"{value:z.{digits}f} {unit}"
+
+
+def profile(heights_mm: Sequence[float | None]) -> str:
+    """Heights along the blade as bars, with the highest as a number; ``·`` no soil, ``?`` not seen."""
+    highest_mm = max((height_mm for height_mm in heights_mm if height_mm is not None), default=None)
+    full_mm = max(highest_mm or 0.0, TALL_MM)
+    bars = "".join(_bar(height_mm, full_mm) for height_mm in heights_mm)
+    told = "none of it seen" if highest_mm is None else f"{number(highest_mm, 'mm', 0)} high"
+    return f"left {bars} right, {told}"
+
+
+def _bar(height_mm: float | None, full_mm: float) -> str:
+    if height_mm is None:
+        return UNSEEN
+    return LEVEL if height_mm < 1.0 else BARS[min(int(height_mm / full_mm * len(BARS)), len(BARS) - 1)]
 
 
 def _head(status: Status) -> Iterator[Line]:
@@ -165,6 +185,8 @@ def _soil(status: Status) -> Iterator[Line]:
         if litres is not None:
             told_l = "  ".join(f"{third} {litres[third + '_l']:.1f} l" for third in THIRDS)
             yield Line(f"  {name.ljust(8)} {told_l}")
+    if soil["profile_mm"] is not None:
+        yield Line(f"  profile  {profile(soil['profile_mm'])}", "plain", 6)
     decision = status["decision"]
     angle = "none" if decision["zone"] is None else number(decision["angle_deg"], "deg")
     because = f": {decision['reason']}" if decision["reason"] else ""

@@ -78,22 +78,22 @@ export function front(attitude) {
   }
 }
 
-/** Soil along the blade in the operator's order: what lies ahead above what is carried, in litres. */
+/** How high the soil stands along the blade, from its left end to its right; grey: not seen there. */
 export function profile(soil) {
   const { draw, width, height } = sheet("profile");
-  const floor = height - 4, wide = width / 3;
-  line(draw, [[4, floor], [width - 4, floor]], color("ink"), 3);
-  const known = (part, third) => (part ? part[`${third}_l`] : null);
-  const totals = THIRDS.map((third) => (known(soil.ahead, third) ?? soil[`volume_${third}_l`] ?? 0) + (known(soil.carried, third) ?? 0));
-  const most = Math.max(6, ...totals), scale = (floor - 26) / most;
-  THIRDS.forEach((third, i) => {
-    const x = (i + 0.1) * wide, w = wide * 0.8;
-    const carried = known(soil.carried, third) ?? 0, ahead = known(soil.ahead, third) ?? soil[`volume_${third}_l`];
-    if (ahead === null || ahead === undefined) return;
-    draw.fillStyle = color(third); draw.globalAlpha = 0.45; draw.fillRect(x, floor - carried * scale, w, carried * scale);
-    draw.globalAlpha = 1; draw.fillRect(x, floor - (carried + ahead) * scale, w, ahead * scale);
-    words(draw, totals[i].toFixed(1), x + w / 2, floor - (carried + ahead) * scale - 6);
+  const heights = soil.profile_mm ?? [], known = heights.filter((mm) => mm !== null);
+  const floor = height - 6, left = width / 4, wide = (width - left) / (heights.length || 1);
+  const most = 100 * Math.ceil(Math.max(200, ...known) / 100), scale = (floor - 16) / most;
+  for (let mm = 100; mm <= most; mm += 100) {
+    line(draw, [[left, floor - mm * scale], [width, floor - mm * scale]], "#c9c9c4", 1);
+    words(draw, `${mm} mm`, left - 8, floor - mm * scale + 5, color("soft"), "right");
+  }
+  heights.forEach((mm, i) => {
+    const tall = mm === null ? floor - 16 : mm * scale;
+    draw.fillStyle = mm === null ? "#d5d5d0" : color(THIRDS[Math.floor(i * 3 / heights.length)]);
+    draw.fillRect(left + i * wide + 1, floor - tall, wide - 2, tall);
   });
+  line(draw, [[left, floor], [width, floor]], color("ink"), 3);
 }
 
 /** A plot of series `{points: [[ms, value or null]], stroke, wide}` over the last `span_ms`; a gap is a gap. */

@@ -20,7 +20,7 @@ const TEXTS = {
     m_disarmed: "DISARMED", m_manual: "MANUAL", m_auto: "AUTOMATIC", m_stopped: "STOPPED", arming: "ARMING",
     z_left: "LEFT", z_center: "CENTER", z_right: "RIGHT", z_even: "EVEN", z_none: "NO SOIL", z_unknown: "NOT SURE",
     travel: "travel", other: "Language: Korean", stop: "STOP", stop_key: "The space bar stops as well.",
-    alt_camera: "live picture of the soil before the blade", alt_profile: "soil along the blade, ahead and carried", alt_plan: "blade from above with requested, limited and measured angle", alt_front: "blade from behind with height, slope and tilt", alt_plot: "plot over the last ten minutes",
+    alt_camera: "live picture of the soil before the blade", alt_profile: "height of the soil along the blade, from its left end to its right", alt_plan: "blade from above with requested, limited and measured angle", alt_front: "blade from behind with height, slope and tilt", alt_plot: "plot over the last ten minutes",
   },
   ko: {
     connecting: "연결 중 …", heard: "{} 초 전 수신", live: "수신 중", never: "아직 수신 없음",
@@ -42,7 +42,7 @@ const TEXTS = {
     m_disarmed: "해제됨", m_manual: "수동", m_auto: "자동", m_stopped: "정지됨", arming: "준비 중",
     z_left: "왼쪽", z_center: "가운데", z_right: "오른쪽", z_even: "고름", z_none: "흙 없음", z_unknown: "불확실",
     travel: "진행 방향", other: "언어: 영어", stop: "정지 STOP", stop_key: "스페이스 바로도 정지합니다.",
-    alt_camera: "블레이드 앞 흙의 실시간 영상", alt_profile: "블레이드를 따라 본 흙, 전방과 운반 중", alt_plan: "위에서 본 블레이드의 요청, 제한, 측정 각도", alt_front: "뒤에서 본 블레이드의 높이, 경사, 기울기", alt_plot: "최근 10분 그래프",
+    alt_camera: "블레이드 앞 흙의 실시간 영상", alt_profile: "블레이드 왼쪽 끝에서 오른쪽 끝까지 흙의 높이", alt_plan: "위에서 본 블레이드의 요청, 제한, 측정 각도", alt_front: "뒤에서 본 블레이드의 높이, 경사, 기울기", alt_plot: "최근 10분 그래프",
   },
 };
 

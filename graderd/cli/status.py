@@ -21,7 +21,7 @@ from graderd.cli.console import (
 )
 from graderd.client import Client
 from graderd.hal.text import printable
-from graderd.view import LEAST_COLUMNS_N, LEAST_LINES_N, STYLES, lines
+from graderd.view import LEAST_COLUMNS_N, LEAST_LINES_N, STYLES, lines, profile
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -173,6 +173,7 @@ def _told_apart(soil: dict[str, Any]) -> list[Row]:
     return [
         ("ahead", f"{ahead['zone']} ({ahead['confidence']:.0%} sure; {_litres(ahead)}; {ahead['reason']})"),
         ("carried", _litres(soil["carried"])),
+        *([("profile", profile(soil["profile_mm"]))] if soil["profile_mm"] is not None else []),
     ]
 
 

@@ -32,6 +32,12 @@ class Zone(StrEnum):
     UNKNOWN = "unknown"
 
 
+PROFILE_BINS_N = 24
+"""A profile along the blade has so many values: 42 mm each on a blade of 1 m, eight a third."""
+Profile = tuple[float | None, ...]
+"""One value for each of ``PROFILE_BINS_N`` equal parts of the blade, from its left end to its right; None where it is
+not known."""
+
 OPPOSITE = {Zone.LEFT: Zone.RIGHT, Zone.RIGHT: Zone.LEFT}
 """The side that a side must never be taken for."""
 
@@ -86,7 +92,9 @@ class SoilObservation:
     where the method has no depth and cannot.
 
     ``capture_s``: monotonic time of the picture. ``share_*``: parts of the soil in each third, sum 1 (all 0 where
-    there is none). ``volume_*_l``: litres per third, None where the method has no depth. ``confidence``: 0 to 1.
+    there is none). ``volume_*_l``: litres per third, None where the method has no depth. ``profile_mm``: how
+    high the soil before each part of the blade stands above the ground, at its highest; 0 where there is none, None
+    where less than half of that part was seen, and as a whole where the method has no depth. ``confidence``: 0 to 1.
     ``reason``: one line why. ``blade_angle_deg``: the angle the thirds were laid at, ``blade_angle_age_s`` its age
     at capture. ``faults``: what is wrong with the picture; with any of them ``zone`` is UNKNOWN.
     """
@@ -109,6 +117,7 @@ class SoilObservation:
     faults: tuple[PictureFault, ...] = ()
     ahead: SoilAhead | None = None
     carried: Thirds | None = None
+    profile_mm: Profile | None = None
 
     def share_of(self, zone: Zone) -> float:
         """Share of the soil in one third; 0 for zones that are no third."""

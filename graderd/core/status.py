@@ -9,7 +9,7 @@ from __future__ import annotations
 from pydantic import BaseModel, ConfigDict
 
 from graderd.core.machine import Mode
-from graderd.core.soil import Zone
+from graderd.core.soil import Profile, Zone
 from graderd.hal.device import Lifecycle
 
 
@@ -81,7 +81,9 @@ class SoilStatus(_Status):
     """The newest observation of the soil: all that lies in front of the blade, and told apart what lies ahead and what
     it carries; these two, and the litres, are null where the method has no depth. Once its picture is too old, ``zone``
     is unknown, and so is the rest: where ``zone`` is unknown no share is told. ``age_s`` is of the picture that all of
-    it is from."""
+    it is from. ``profile_mm``: how high the soil stands above the ground along the blade, at its highest before each of
+    24 equal parts from the left end to the right; null for a part that was not seen, and as a whole where the method
+    has no depth."""
 
     zone: Zone = Zone.UNKNOWN
     confidence: float = 0.0
@@ -95,6 +97,7 @@ class SoilStatus(_Status):
     volume_right_l: float | None = None
     ahead: AheadStatus | None = None
     carried: ThirdsStatus | None = None
+    profile_mm: Profile | None = None
     blade_angle_deg: float | None = None
     frame_number_n: int = -1
     frames_per_s: float = 0.0

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from graderd.core.attitude import UNMEASURED, MeasuredAttitude
 from graderd.core.blade import BladeGeometry
-from graderd.core.soil import Mounting, PictureFault, SoilAhead, SoilObservation, Thirds, Zone
+from graderd.core.soil import Mounting, PictureFault, Profile, SoilAhead, SoilObservation, Thirds, Zone
 from graderd.hal.camera import Frame, Intrinsics
 from graderd.hal.settings import CameraSettings
 from graderd.perception import annotate as drawing
@@ -66,15 +66,18 @@ class Classifier(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """What a healthy picture says: all soil, and where the method has depth that ahead and that carried (litres)."""
+    """What a healthy picture says: all soil, and where the method has depth that ahead, that carried (litres), and how
+    high it stands along the blade."""
 
     verdict: Verdict
     ahead: Verdict | None = None
     carried_l: tuple[float, float, float] | None = None
+    profile_mm: Profile | None = None
 
     def unknown(self, reason: str) -> _Judged:
         """The same numbers, not believed."""
-        return _Judged(self.verdict.unknown(reason), self.ahead and self.ahead.unknown(reason), self.carried_l)
+        ahead = self.ahead and self.ahead.unknown(reason)
+        return _Judged(self.verdict.unknown(reason), ahead, self.carried_l, self.profile_mm)
 
 
 class SoilClassifier:
@@ -219,10 +222,11 @@ class SoilClassifier:
         ahead = judge.verdict_ahead(soil, by_depth)
         faults = self._seen(soil, stance)
         if region is None or settings.method == "depth" or faults:
-            return _Judged(by_depth, ahead, soil.carried_l), faults
+            return _Judged(by_depth, ahead, soil.carried_l, soil.profile_mm), faults
         cross_check = fast_color_verdict(frame.color_bgr, region, settings.color, settings.decision)
         # Colour cannot tell ahead from carried: what it sees before the blade objects to either.
-        return _Judged(fuse(by_depth, cross_check), fuse(ahead, cross_check), soil.carried_l), []
+        told = fuse(by_depth, cross_check), fuse(ahead, cross_check)
+        return _Judged(*told, soil.carried_l, soil.profile_mm), []
 
     def _seen(self, soil: HeightMap, stance: Stance) -> list[PictureFault]:
         return self._health.misplaced(soil, stance) or obstructed(soil)
@@ -278,6 +282,7 @@ class SoilClassifier:
             if ahead
             else None,
             carried=_thirds(judged.carried_l) if judged.carried_l else None,
+            profile_mm=judged.profile_mm,
         )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graderd.core.blade import STEEPEST_MEETING_DEG, BladeGeometry, meeting_point
-from graderd.core.soil import Zone
+from graderd.core.soil import PROFILE_BINS_N, Profile, Zone
 from graderd.hal.camera import DepthImage
 from graderd.perception.decide import Verdict, decide
 from graderd.perception.forms import (
@@ -77,7 +77,7 @@ class HeightMap:
     ``things_l``, ``weak_l``: what else rises there, and is no soil or does not stand out of the uneven ground.
     ``angle_deg``: where the blade was found. ``standing_at_m``: s and d of something that stands upright. ``cut_m``:
     how far the edge is under what looks like ground, where no lift says why. ``form_is_sure``: noise does not drown
-    what tells soil from things.
+    what tells soil from things. ``profile_mm``: see :class:`~graderd.core.soil.SoilObservation`.
     """
 
     height_m: F64
@@ -97,6 +97,7 @@ class HeightMap:
     standing_at_m: tuple[float, float] | None
     cut_m: float
     form_is_sure: bool
+    profile_mm: Profile
 
 
 class DepthJudge:
@@ -134,6 +135,8 @@ class DepthJudge:
         # How much steep soil, and soil at its angle of repose, rises from cell to cell.
         self._steepest_m = math.tan(math.radians(settings.form.steepest_deg)) * self._cell_d_m
         self._repose_m = math.tan(math.radians(settings.repose_deg)) * self._cell_d_m
+        # Where the profile's parts begin and end, in rows of the map, the right end's first as the rows.
+        self._profile_rows = np.linspace(0.0, self._along_n, PROFILE_BINS_N + 1)
         self._before = slice(self._beside_n, self._beside_n + self._along_n), slice(self._ahead_n)
 
     def height_map(self, depth_mm: DepthImage, stance: Stance) -> HeightMap:
@@ -379,7 +382,21 @@ class DepthJudge:
             standing_at_m,
             cut_m,
             form_is_sure=not bool((noise_m[forms.things] * SLOPE_NOISE_RATIO > form.steep_spread_m).any()),
+            profile_mm=self._profile_mm(filled[self._before] * forms.soil[self._before], seen[self._before]),
         )
+
+    def _profile_mm(self, soil_m: F64, seen: Bools) -> Profile:
+        """The crest of the soil along the blade: the mean of the rows that lie before each part of it."""
+        known = seen.any(axis=1)
+        rows = np.zeros((2, known.size + 1))
+        np.cumsum((np.maximum(soil_m, 0.0).max(axis=1) * known, known), axis=1, out=rows[:, 1:])
+        # A part's border may cut a row in two: each has its share of it.
+        borders = np.arange(known.size + 1)
+        crests_m, known_n = (np.diff(np.interp(self._profile_rows, borders, sums)) for sums in rows)
+        enough = known_n >= 0.5 * known.size / PROFILE_BINS_N
+        heights_mm = np.round(1000.0 * crests_m / np.where(enough, known_n, 1.0), 1) + 0.0  # no -0
+        left_first = zip(heights_mm[::-1].tolist(), enough[::-1].tolist(), strict=True)
+        return tuple(height_mm if is_known else None for height_mm, is_known in left_first)
 
     def _split(self, height: F64, where: Bools, angle_deg: float) -> tuple[Litres, Litres, Litres]:
         """Litres per third of the map's cells ``where``: all before the blade, carried by it, and ahead of it."""

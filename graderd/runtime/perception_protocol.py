@@ -16,12 +16,15 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
-from graderd.core.soil import SoilObservation
+from graderd.core.soil import PROFILE_BINS_N, SoilObservation
 from graderd.hal.settings import AnyCameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
 from graderd.record.layout import FramesWanted
 
 _OBSERVATION: TypeAdapter[SoilObservation] = TypeAdapter(SoilObservation)
+
+MAX_HEIGHT_MM = 10_000.0
+"""No soil that a blade meets stands higher: what says so is not right."""
 
 
 class _Message(BaseModel):
@@ -132,14 +135,23 @@ class Observed(_Message):
             raise ValueError(f"confidence {observation.ahead.confidence} of the soil ahead is not between 0 and 1")
         if not all(map(math.isfinite, _floats(asdict(observation)))):
             raise ValueError("a number in it is not finite")
+        profile_mm = observation.profile_mm
+        if profile_mm is not None:
+            if len(profile_mm) != PROFILE_BINS_N:
+                raise ValueError(f"profile_mm has {len(profile_mm)} heights, not {PROFILE_BINS_N}")
+            if not all(0.0 <= height_mm <= MAX_HEIGHT_MM for height_mm in _floats(profile_mm)):
+                raise ValueError(f"a height in profile_mm is not between 0 and {MAX_HEIGHT_MM:.0f} mm")
         return observation
 
 
-def _floats(content: dict[str, Any]) -> Iterator[float]:
-    for value in content.values():
-        if isinstance(value, float):
-            yield value
-        elif isinstance(value, dict):
+def _floats(content: object) -> Iterator[float]:
+    if isinstance(content, float):
+        yield content
+    elif isinstance(content, dict):
+        for value in content.values():
+            yield from _floats(value)
+    elif isinstance(content, list | tuple):
+        for value in content:
             yield from _floats(value)
 
 

@@ -127,6 +127,7 @@ def _soil(newest: SoilObservation | None, frames_per_s: float, now_s: float) -> 
         volume_right_l=newest.volume_right_l,
         ahead=newest.ahead and _ahead(newest.ahead),
         carried=newest.carried and ThirdsStatus(**_litres(newest.carried)),
+        profile_mm=newest.profile_mm,
         blade_angle_deg=newest.blade_angle_deg,
         frame_number_n=newest.frame_number,
         frames_per_s=frames_per_s,

@@ -25,6 +25,16 @@ SHOWN_NUMBERS = """[...document.querySelectorAll('[data-v], #jogs output')].map(
 CUT = """[...document.querySelectorAll('button, th, td, dd, dt, h2, label, #mode, #heard')]
     .filter((e) => e.offsetParent && e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).display !== 'inline')
     .map((e) => e.outerHTML.slice(0, 120))"""
+PROFILE = """(() => {
+    const { data } = document.getElementById('profile').getContext('2d').getImageData(0, 0, 10000, 10000);
+    const kinds = { '10,107,44': 0, '11,79,158': 1, '168,50,10': 2 }, found = [0, 0, 0];
+    for (let i = 0; i < data.length; i += 4) {
+        const kind = kinds[`${data[i]},${data[i + 1]},${data[i + 2]}`];
+        if (kind !== undefined) found[kind]++;
+    }
+    return found;
+})()"""
+"""How many pixels of the profile have the colour of the left, the center, the right third."""
 SMALL = """[...document.querySelectorAll('button')].filter((e) => e.offsetParent)
     .map((e) => [e.id || e.textContent, e.offsetWidth, e.offsetHeight]).filter(([, w, h]) => w < 56 || h < 56)"""
 
@@ -105,6 +115,13 @@ def test_a_decision_changes_in_sight(cab: Cab) -> None:
     expect(page.locator("[data-v=decision]")).to_have_text("LEFT → 30.0°")
     expect(page.locator("#mode strong")).to_have_text("AUTOMATIC · SIMULATED")
     cab.until(lambda s: s["axes"]["rotation"]["arrived"], "turned")
+    left_n, _, right_n = page.evaluate(PROFILE)
+    assert left_n > 20 * right_n + 500, "the soil lies left"
+    page.uncheck("#mirror")  # that turns the picture alone
+    page.wait_for_timeout(300)
+    left_n, _, right_n = page.evaluate(PROFILE)
+    assert left_n > 20 * right_n + 500
+    page.check("#mirror")
     shot(page, "work-left")
     cab.rig("scene", zone="right")
     expect(page.locator("[data-v=decision]")).to_have_text("RIGHT → −30.0°")

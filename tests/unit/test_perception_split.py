@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from graderd.core.blade import BladeGeometry, meeting_point
-from graderd.core.soil import SoilObservation, Zone
+from graderd.core.soil import PROFILE_BINS_N, Profile, SoilObservation, Zone
 from graderd.hal.camera import Frame
 from graderd.perception.classifier import make_classifier
 from graderd.perception.depth import Cells, SoilSplit
 from graderd.perception.geometry import CENTER, LEFT, RIGHT
 from graderd.perception.settings import CameraCalibration, Method, PerceptionSettings
+from graderd.runtime.perception_protocol import FromChild, Observed
 from graderd.simulator.camera.appearance import Appearance
 from graderd.simulator.camera.ground import SceneState
 from graderd.simulator.camera.renderer import Renderer
@@ -110,9 +113,13 @@ def look(zone: Zone, angle_deg: float, method: Method = "depth") -> SoilObservat
     return classifier.classify(picture(zone, angle_deg), angle_deg, 0.01, ON_GROUND)
 
 
-@cache
 def picture(zone: Zone, angle_deg: float) -> Frame:
-    """Of the heap before a blade that was pushed against it; made once for all methods."""
+    return scene(zone, angle_deg)[1]
+
+
+@cache
+def scene(zone: Zone, angle_deg: float) -> tuple[World, Frame]:
+    """The heap before a blade that was pushed against it, and its picture; made once for all methods."""
     world = World()
     world.blade = BladePose(angle_deg)
     world.lay(scene_heights(SceneZone(zone), world.vehicle.x_m, world.blade, 2))
@@ -121,12 +128,56 @@ def picture(zone: Zone, angle_deg: float) -> Frame:
     renderer = Renderer((640, 400), (424, 240), seed=3)
     seen = SceneState(world.field.heights_m.astype(np.float32), world.field.cell_m, world.vehicle.x_m, world.blade)
     color, depth = renderer.render(seen, Appearance())
-    return Frame(color, depth, renderer.color_intrinsics, renderer.depth_intrinsics, 0.0)
+    return world, Frame(color, depth, renderer.color_intrinsics, renderer.depth_intrinsics, 0.0)
+
+
+@pytest.mark.xdist_group("pictures before a turned blade")
+@pytest.mark.parametrize(("zone", "angle_deg"), [(Zone.LEFT, 0.0), (Zone.CENTER, -30.0), (Zone.RIGHT, 30.0)])
+def test_the_profile_is_the_crest_of_what_lies_before_the_blade(zone: Zone, angle_deg: float) -> None:
+    profile_mm = look(zone, angle_deg).profile_mm
+    assert profile_mm is not None
+    assert len(profile_mm) == PROFILE_BINS_N
+    assert profile_mm.count(None) <= 2, "only what its own heap hides at the blade's end"
+    told = [(mm, true_mm) for mm, true_mm in zip(profile_mm, crests_mm(zone, angle_deg), strict=True) if mm is not None]
+    assert max(abs(mm - true_mm) for mm, true_mm in told) < 15.0
+    assert max(mm for mm, _ in told) > 200.0
+    assert min(mm for mm, _ in told) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "because"),
+    [
+        ((0.0,) * 23, "has 23 heights"),
+        ((None,) * 25, "has 25 heights"),
+        (23 * (0.0,) + (-0.1,), "not between"),
+        (23 * (None,) + (10_000.1,), "not between"),
+        (23 * (None,) + (math.nan,), "not finite"),
+    ],
+)
+def test_a_profile_that_cannot_be_is_not_taken_from_the_child(wrong: Profile, because: str) -> None:
+    observation = look(Zone.LEFT, 0.0)
+    told = FromChild.validate_json(Observed.of(observation).model_dump_json())
+    assert isinstance(told, Observed)
+    assert told.unpack() == observation
+    with pytest.raises(ValueError, match=because):
+        Observed.of(replace(observation, profile_mm=wrong)).unpack()
+
+
+def crests_mm(zone: Zone, angle_deg: float) -> list[float]:
+    """How high the soil in the rig's bed truly stands before each part of the blade, from its left end."""
+    world, _ = scene(zone, angle_deg)
+    s = BLADE.length_m * (np.arange(0.5, 10 * PROFILE_BINS_N) / (10 * PROFILE_BINS_N) - 0.5)
+    s, ahead = np.meshgrid(s, BLADE.x_offset_m + np.arange(0.01, BLADE.reach_m, 0.01))
+    cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    heights_m = world.field.height_at(world.vehicle.x_m + cos * ahead - sin * s, sin * ahead + cos * s)
+    parts_m = heights_m.max(axis=0)[::-1].reshape(PROFILE_BINS_N, -1)
+    return [1000.0 * float(part_m.mean()) for part_m in parts_m]
 
 
 @pytest.mark.parametrize("method", ["paper", "fast_color"])
 def test_colour_cannot_tell_and_says_so(method: Method) -> None:
     observation = look(Zone.LEFT, 0.0, method)
+    assert observation.profile_mm is None
     assert observation.ahead is None
     assert observation.carried is None
     assert observation.coming.zone is observation.zone

@@ -171,9 +171,11 @@ class _Eyes:
 
 async def test_what_is_past_its_age_is_told_as_unknown(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    await bench.ticks(5, zone=Zone.LEFT, share_left=1.0, volume_left_l=3.0)
+    profile_mm = (12.5, None) * 12
+    await bench.ticks(5, zone=Zone.LEFT, share_left=1.0, volume_left_l=3.0, profile_mm=profile_mm)
     told = build_status(Config(), bench.loop, _Eyes())  # type: ignore[arg-type]  # all that is asked of it
     assert (told.soil.zone, told.soil.share_left, told.soil.volume_left_l) == (Zone.LEFT, 1.0, 3.0)
+    assert told.soil.profile_mm == profile_mm
     rotation = told.axes["rotation"]
     assert rotation.measured is not None
     assert "measured" in rotation.ages_s
@@ -187,6 +189,7 @@ async def test_what_is_past_its_age_is_told_as_unknown(tmp_path: Path) -> None:
     assert (told.soil.zone, told.soil.confidence, told.soil.share_left, told.soil.volume_left_l) == (
         Zone.UNKNOWN, 0.0, None, None
     )  # fmt: skip
+    assert told.soil.profile_mm is None
     assert told.soil.age_s is not None
     assert told.soil.age_s > 3.0
     lost = told.axes["rotation"]

@@ -23,7 +23,7 @@ from graderd.cli.watch_app import HOLDS, KEYS, STALE_S, WatchApp
 from graderd.core.machine import Mode
 from graderd.core.soil import Zone
 from graderd.core.status import AheadStatus, FaultStatus, RequirementStatus, SoilStatus, ThirdsStatus
-from graderd.view import LEAST_COLUMNS_N, fitting, lines, shown
+from graderd.view import LEAST_COLUMNS_N, fitting, lines, profile, shown
 from harness.api_daemon import FakeDaemon, serving
 from harness.person import Person
 
@@ -59,6 +59,7 @@ def status_of(faults_n: int, unmet_n: int = 0) -> dict[str, Any]:
         share_right=0.18,
         ahead=AheadStatus(zone=Zone.LEFT, confidence=0.9, reason="more of it", **litres),
         carried=ThirdsStatus(**litres),
+        profile_mm=(None, 0.0, *(10.0 * n for n in range(22))),
     )
     status = daemon.status().model_copy(
         update={
@@ -90,6 +91,13 @@ def test_it_fits_faults_first_and_no_number_is_cut(columns_n: int, lines_n: int,
             assert whole in shown(found)
         assert sum("lift and free the blade" in line for line in text) == faults_n
     assert not re.search(r"\d…", shown(found)), "a number with its end cut off is another number"
+
+
+def test_the_profile_is_bars_with_its_highest_as_a_number() -> None:
+    bars = "left ?··▁▁▂▂▂▃▃▄▄▄▅▅▅▆▆▇▇▇███ right, 210 mm high"
+    assert f"  profile  {bars}" in shown(lines(status_of(0), 60, 20)).split("\n")
+    assert profile((None,) * 24) == f"left {24 * '?'} right, none of it seen"
+    assert profile((12.0, None) * 12) == f"left {12 * '▁?'} right, 12 mm high"
 
 
 @pytest.mark.parametrize("columns_n", range(8, 60))
