@@ -24,10 +24,11 @@ log = logging.getLogger(__name__)
 
 
 class Link(Protocol):
-    """The CAN bus under the actuators: opened before them, closed after them."""
+    """The CAN bus: it is opened whether a device is on it or not (it brings stop messages, and takes diagnostic ones),
+    by whoever comes first, and closed after all of them."""
 
     async def open(self) -> None:
-        """Open the channel and claim our address; afterwards it keeps itself open.
+        """Open the channel and claim our address, or do nothing where that is done; afterwards it keeps itself open.
 
         Raises:
             DeviceMissingError: the channel does not exist.
@@ -69,8 +70,8 @@ class Devices:
         return {"rotation": self.rotation, **self.actuators}
 
     def problem_of(self, axis: str) -> str:
-        """Why the axis's device is not open, empty where nothing is known. An actuator waits for its bus."""
-        return self.problems.get(axis, "") or (self.problems.get("can", "") if axis in self.actuators else "")
+        """Why the axis's device is not open, empty where nothing is known."""
+        return self.problems.get(axis, "")
 
     def hold_all(self) -> tuple[str, ...]:
         """Ask every axis to stop where it is, each in its own try; returns the axes whose driver raised."""
@@ -155,19 +156,15 @@ async def _finished(task: asyncio.Task[None] | None) -> None:
 
 
 async def open_devices(devices: Devices) -> None:
-    """Open the bus, then all axes side by side. What fails is told and tried again; the log repeats it more rarely."""
+    """Open the bus and all axes side by side: an axis with a wire of its own does not wait for a bus that is not there,
+    and one that is on the bus opens it itself. What fails is told and tried again; the log repeats it more rarely."""
+    openings: dict[str, Callable[[], Awaitable[None]]] = {"can": devices.link.open}
+    openings |= {name: device.open for name, device in devices.all().items()}
     async with asyncio.TaskGroup() as group:
-        group.create_task(_keep_trying("rotation", devices.rotation.open, devices.problems), name="open-rotation")
-        group.create_task(_open_bus(devices), name="open-can")
+        for name, open_device in openings.items():
+            group.create_task(_keep_trying(name, open_device, devices.problems), name=f"open-{name}")
         if devices.vehicle is not None:
             group.create_task(devices.vehicle.open(), name="open-vehicle")
-
-
-async def _open_bus(devices: Devices) -> None:
-    await _keep_trying("can", devices.link.open, devices.problems)
-    async with asyncio.TaskGroup() as group:
-        for name, actuator in devices.actuators.items():
-            group.create_task(_keep_trying(name, actuator.open, devices.problems), name=f"open-{name}")
 
 
 async def _keep_trying(name: str, open_device: Callable[[], Awaitable[None]], problems: dict[str, str]) -> None:
@@ -175,8 +172,12 @@ async def _keep_trying(name: str, open_device: Callable[[], Awaitable[None]], pr
         try:
             await open_device()
         except DeviceError as error:
-            log.warning("%s: cannot be opened: %s", name, error, extra={"device": name})
-            problems[name] = str(error)
+            problem = str(error)
+            # A bus that is not there is told once, not by each device on it.
+            told = any(theirs == problem for other, theirs in problems.items() if other != name)
+            if not told:
+                log.warning("%s: cannot be opened: %s", name, error, extra={"device": name})
+            problems[name] = problem
             await asyncio.sleep(RETRY_S)
         else:
             problems.pop(name, None)

@@ -1,7 +1,8 @@
-"""The small parts of the runtime: state file, systemd notifier, health watch, angle history."""
+"""The small parts of the runtime: state file, systemd notifier, health watch, angle history, opening of devices."""
 
 from __future__ import annotations
 
+import asyncio
 import os
 import socket
 import time
@@ -13,12 +14,18 @@ from graderd.config import Config, parse
 from graderd.core.machine import Mode
 from graderd.core.soil import Zone
 from graderd.core.status import CameraStatus, Status
+from graderd.hal.clock import ManualClock
+from graderd.hal.device import Lifecycle
+from graderd.hal.errors import DeviceMissingError
+from graderd.runtime import devices as devices_module
 from graderd.runtime import state_file
 from graderd.runtime.app.perception_child import AngleHistory, settings_not_kept
+from graderd.runtime.devices import Devices, open_devices
 from graderd.runtime.health import HealthWatch
 from graderd.runtime.sd_notify import SystemdNotifier
 from graderd.runtime.state_file import StateFile
 from graderd.runtime.status import build_status
+from harness.fakes import FakeActuator, FakeLink, FakeRotator
 from tests.unit.test_runtime_control import Bench
 
 STATUS = Status(
@@ -204,3 +211,49 @@ async def test_what_is_past_its_age_is_told_as_unknown(tmp_path: Path) -> None:
     attitude, tilt = told.attitude, told.axes["tilt"]
     assert (attitude.height_mm, attitude.lifts_age_s, attitude.pitch_deg, attitude.pitch_age_s) == (None,) * 4
     assert (tilt.flags, tilt.thermal_load) == (None, None)
+
+
+class NoBus(FakeLink):
+    """A bus that is not there yet."""
+
+    gone = True
+
+    async def open(self) -> None:
+        if self.gone:
+            raise DeviceMissingError("CAN socketcan can0", "no such interface", "Set it up")
+
+
+class OnTheBus(FakeActuator):
+    """An actuator that opens the bus it is on, as the contract of the link asks."""
+
+    link: NoBus
+
+    async def open(self) -> None:
+        await self.link.open()
+        await super().open()
+
+
+async def test_who_has_a_wire_of_its_own_does_not_wait_for_a_bus_that_is_not_there(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(devices_module, "RETRY_S", 0.0)
+    clock, link, log = ManualClock(), NoBus(), list[str]()
+    rotator = FakeRotator("rotation", clock, 0.0, log)
+    lift, tilt = OnTheBus("lift_left", clock, 100.0, log), FakeActuator("tilt", clock, 50.0, log)
+    lift.link = link
+    for device in (rotator, lift, tilt):
+        device.lifecycle = Lifecycle.CLOSED
+    devices = Devices(rotator, link, {"lift_left": lift, "tilt": tilt})
+    opening = asyncio.create_task(open_devices(devices))
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert (tilt.lifecycle, devices.problem_of("tilt")) == (Lifecycle.STANDBY, "")
+    assert rotator.lifecycle is Lifecycle.STANDBY
+    assert lift.lifecycle is Lifecycle.CLOSED
+    assert "no such interface" in devices.problem_of("lift_left")
+    told = [record.getMessage() for record in caplog.records if "cannot be opened" in record.getMessage()]
+    assert told, "the bus's absence is told"
+    assert all(line.startswith("can: ") for line in told), "by the bus alone, not by each device on it"
+    link.gone = False
+    await opening
+    assert (lift.lifecycle, devices.problems) == (Lifecycle.STANDBY, {})
