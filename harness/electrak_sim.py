@@ -159,7 +159,7 @@ class Machine:
 
     async def _watch(self) -> None:
         config = Config()
-        monitor = PlausibilityMonitor(motion_figures(config.rotation, config.figures()))
+        monitor = PlausibilityMonitor(motion_figures(config.rotation, config.actuators(), config.figures()))
         while True:
             samples = [axis_sample(name, axis.lifecycle, axis.telemetry()) for name, axis in self.axes.items()]
             self.judged = monitor.judge((sample for sample in samples if sample is not None), self.clock.now_s())

@@ -123,8 +123,9 @@ async def bench(
     try:
         if opened:
             await rotator.open()
-        figures = Config().model_copy(update={"rotation": settings}).figures()  # a slow watchdog among them
-        yield Bench(rotator, servo, bus, clock, PlausibilityMonitor(motion_figures(settings, figures)))
+        config = Config().model_copy(update={"rotation": settings})  # a slow watchdog among them
+        motion = motion_figures(settings, config.actuators(), config.figures())
+        yield Bench(rotator, servo, bus, clock, PlausibilityMonitor(motion))
     finally:
         await rotator.close()
         await bus.close()

@@ -267,6 +267,7 @@ class Config(Settings):
             ("control.overrun_s", self.control.overrun_s, 1, ticks),
             ("lift_pair.silent_s", pair.silent_s, 1, ticks),
             ("rotation.not_moving_s", rotation.not_moving_s, 3, ticks),
+            *((f"{axis}.not_moving_s", own.not_moving_s, 3, ticks) for axis, own in self.actuators().items()),
         ]
         if isinstance(rotation, Ph54Settings):
             polls = ("rotation.poll_hz", 1.0 / rotation.poll_hz)

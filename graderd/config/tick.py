@@ -12,7 +12,7 @@ def tick_settings(config: Config) -> TickSettings:
     figures = config.figures()
     return TickSettings(
         figures=figures,
-        motion=motion_figures(config.rotation, figures),
+        motion=motion_figures(config.rotation, config.actuators(), figures),
         machine=config.machine,
         rule=config.rule,
         gate=config.gate,

@@ -21,7 +21,7 @@ from graderd.hal.device import Lifecycle
 from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.rotator import RotatorTelemetry
-from graderd.hal.settings import NotNegative, Positive, RotatorSettings, Settings
+from graderd.hal.settings import ActuatorSettings, NotNegative, Positive, RotatorSettings, Settings
 
 
 class MotionFigures(Settings):
@@ -67,12 +67,11 @@ _SETTLE_S = 0.5
 _SAME_GOAL = 0.05
 
 
-def motion_figures(rotation: RotatorSettings, figures: Mapping[str, AxisFigures]) -> dict[str, MotionFigures]:
-    """For every axis in ``figures``; those of the actuators fit an Electrak HD or MD.
-
-    Where each comes from: the rotation's from its settings and from the PH54's play of 0.1 degree; the actuators' from
-    control messages every 100 ms, feedback every 105 ms with a noise of 0.1 mm, a start zone of 2 mm, and a brake that
-    stops them within 20 ms.
+def motion_figures(
+    rotation: RotatorSettings, actuators: Mapping[str, ActuatorSettings], figures: Mapping[str, AxisFigures]
+) -> dict[str, MotionFigures]:
+    """For every axis in ``figures``, from its section of the configuration; what stands here as a number is not the
+    device's: play of 0.1 degree at the blade and 0.5 mm at a rod, and a noise of 0.1 mm in a position.
     """
     found: dict[str, MotionFigures] = {}
     for axis, its in figures.items():
@@ -94,18 +93,19 @@ def motion_figures(rotation: RotatorSettings, figures: Mapping[str, AxisFigures]
                 overspeed_margin=3.0,
             )
         else:
+            own = actuators[axis]
             found[axis] = MotionFigures(
                 speed=its.speed,
-                fastest=max(its.speed, 75.0),
-                acceleration=500.0,
-                near=3.0,
-                tolerance=2.0,
+                fastest=max(its.speed, own.fastest_mm_per_s),
+                acceleration=own.braking_mm_per_s2,
+                near=2.0 * its.tolerance,
+                tolerance=its.tolerance + 0.5,
                 still=1.0,
-                reaction_s=0.25,
+                reaction_s=own.reaction_s,
                 rest_s=0.3,
                 moved=0.5,
-                not_moving_s=0.7,
-                not_arriving_s=2.8,
+                not_moving_s=own.not_moving_s,
+                not_arriving_s=4.0 * own.not_moving_s,
                 wrong_way=1.5,
                 wrong_way_s=0.0,
                 overspeed_margin=10.0,

@@ -233,6 +233,24 @@ class ActuatorSettings(Settings):
         le=1.0,
         description="a target not renewed for so long becomes a hold: the axis moves no longer after a dead tick",
     )
+    not_moving_s: Positive = Field(
+        0.7,
+        ge=0.3,
+        le=5.0,
+        description="target ahead and no movement for so long: a motor heats up against a jam",
+    )
+    reaction_s: Positive = Field(
+        0.25,
+        le=0.5,
+        description="from a target to the first position that shows its effect, and from a hold likewise: "
+        "an Electrak's control message, feedback and ramp; what moves on longer is told as uncommanded",
+    )
+    fastest_mm_per_s: Positive = Field(
+        75.0, le=150, description="fastest that the device moves whatever it is told; an Electrak without load 71"
+    )
+    braking_mm_per_s2: Positive = Field(
+        500.0, ge=50, le=10_000, description="how hard the device brakes at least; an Electrak's brake much harder"
+    )
 
     @model_validator(mode="after")
     def _limits(self) -> ActuatorSettings:

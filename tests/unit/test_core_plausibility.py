@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graderd.config import Config
+from graderd.config import Config, parse
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import catalogue_key
 from graderd.core.plausibility import AxisSample, PlausibilityMonitor, axis_sample, motion_figures
@@ -21,7 +21,7 @@ from graderd.hal.rotator import RotatorTelemetry
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo.motion import Profile, Trajectory
 
-FIGURES = motion_figures(Config().rotation, Config().figures())
+FIGURES = motion_figures(Config().rotation, Config().actuators(), Config().figures())
 TICK_S = 0.02
 FEEDBACK_S = 0.105
 Course = Callable[[float], float]
@@ -107,7 +107,7 @@ def test_a_servo_that_obeys_raises_nothing_whatever_it_is_told(
     """Goals, reversals and holds in mid-turn, at the profile's own speed and braking; a hold brakes harder."""
     rotation = Ph54Settings(speed_deg_per_s=top, acceleration_deg_per_s2=acceleration)
     top, acceleration = rotation.profile_velocity_deg_per_s, rotation.profile_acceleration_deg_per_s2
-    monitor = PlausibilityMonitor(motion_figures(rotation, Config(rotation=rotation).figures()))
+    monitor = PlausibilityMonitor(motion_figures(rotation, Config().actuators(), Config(rotation=rotation).figures()))
     trajectory, now_s = Trajectory(), 0.0
     for goal_deg, lasts_s, held in moves:
         trajectory.goal_deg = trajectory.position_deg if held else goal_deg
@@ -143,6 +143,23 @@ def test_a_jog_between_two_readings_is_a_command() -> None:
     course: Course = lambda t: 100.0 if t < 2.05 else 106.0  # noqa: E731
     assert watch("lift_left", course, lambda t: 130.0 if 2.02 <= t < 2.09 else None, 5.0) == {}
     assert "uncommanded_motion" in watch("lift_left", course, lambda _: None, 5.0)
+
+
+def test_an_actuator_is_judged_by_what_its_own_section_says_of_it() -> None:
+    """A slow valve is no runaway where it is known to be slow, and is one by an Electrak's figures."""
+    of_slow = parse({"tilt": {"reaction_s": 0.5, "not_moving_s": 1.5, "braking_mm_per_s2": 60.0}})
+    motion = motion_figures(of_slow.rotation, of_slow.actuators(), of_slow.figures())
+
+    def late(t: float) -> float:
+        """At 60 mm/s for 0.5 s after the hold, then braking at 60 mm/s2."""
+        return 60.0 * min(t, 2.5) + (60.0 * min(t - 2.5, 1.0) - 30.0 * min(t - 2.5, 1.0) ** 2 if t > 2.5 else 0.0)
+
+    goal: Goal = lambda t: 400.0 if t < 2.0 else None  # noqa: E731
+    assert "uncommanded_motion" not in watch("tilt", late, goal, 6.0, monitor=PlausibilityMonitor(motion))
+    assert "uncommanded_motion" in watch("tilt", late, goal, 6.0)
+    stuck = watch("tilt", still(), to(20.0), 4.0, monitor=PlausibilityMonitor(motion))
+    assert 1.0 + 1.5 < stuck["not_moving"] < 1.0 + 1.5 + 0.13
+    assert motion["lift_left"] == FIGURES["lift_left"]
 
 
 # -- not moving, not arriving -----------------------------------------------------------------------------------------
