@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -104,14 +104,8 @@ def _by_command(daemon: SetupDaemon, rotation: dict[str, Any]) -> Stopped:
     client = daemon.client
     goal_deg = _goal_deg(client, rotation, +1.0)
     agree("stop.command", f"1 of 3: the blade turns to {goal_deg:+.0f} deg and is stopped by a command. Is it clear?")
-    arm(client)
-    with client.lease("stop test", rate_hz=STATUS_HZ) as lease:
-        lease.jog("rotate", goal_deg)
-        began_deg = _angle_deg(client.get("/v1/status"))
-        for status in lease.raw_statuses():
-            if abs(_angle_deg(status) - began_deg) >= UNDER_WAY_DEG:
-                break
-        at_deg, at_s = _angle_deg(status), time.monotonic()
+    with _in_mid_turn(client, goal_deg) as at_deg:
+        at_s = time.monotonic()
         client.stop("test of the stop at commissioning")
         rest_deg, rest_s = rest(client)
     stopped = client.get("/v1/status")
@@ -162,14 +156,7 @@ def _by_death(daemon: SetupDaemon, rotation: dict[str, Any]) -> Stopped:
     goal_deg = _goal_deg(client, rotation, -1.0)
     question = f"3 of 3: the blade turns to {goal_deg:+.0f} deg, and the daemon is killed on the way. Is it clear?"
     agree("stop.death", question)
-    arm(client)
-    with client.lease("stop test", rate_hz=STATUS_HZ) as lease:
-        lease.jog("rotate", goal_deg)
-        began_deg = _angle_deg(client.get("/v1/status"))
-        for status in lease.raw_statuses():
-            if abs(_angle_deg(status) - began_deg) >= UNDER_WAY_DEG:
-                break
-        at_deg = _angle_deg(status)
+    with _in_mid_turn(client, goal_deg) as at_deg:
         daemon.kill()
     time.sleep(DEAD_S)
     if not agreed("stop.death.stands", "The daemon is dead. Does the blade stand still?"):
@@ -185,6 +172,20 @@ def _by_death(daemon: SetupDaemon, rotation: dict[str, Any]) -> Stopped:
         raise CliError("stop.death", cause, "See 'graderd profile verify rotation'")
     most_deg = _most_deg(rotation, SPARE_S + float(rotation.get("watchdog_s", 0.0)))
     return Stopped("death", "F5", abs(rest_deg - at_deg), most_deg, None, tripped[0] if tripped else status["reason"])
+
+
+@contextmanager
+def _in_mid_turn(client: Client, goal_deg: float) -> Iterator[float]:
+    """The blade turns there and is well under way: the angle at that moment. The lease is kept meanwhile."""
+    arm(client)
+    with client.lease("stop test", rate_hz=STATUS_HZ) as lease:
+        lease.jog("rotate", goal_deg)
+        began_deg = at_deg = _angle_deg(client.get("/v1/status"))
+        for status in lease.raw_statuses():
+            at_deg = _angle_deg(status)
+            if abs(at_deg - began_deg) >= UNDER_WAY_DEG:
+                break
+        yield at_deg
 
 
 def _swing(client: Client, here_deg: float) -> float:
