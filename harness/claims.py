@@ -585,7 +585,7 @@ CLAIMS: Final = (
         "I13-wires-first",
         "graderd/runtime/control.py",
         "        self.tick = self.controller.step(self.sensed)\n        self._act(self.tick)",
-        "        self.tick = self.controller.step(self.sensed)\n        self._note(before.mode, self.tick.state)\n"
+        "        self.tick = self.controller.step(self.sensed)\n        self._note(before, self.tick.state)\n"
         "        self._act(self.tick)",
         (CONTROL + "test_the_wires_come_before_the_log_and_the_state_file",),
         "the wires wait for log and state file",
