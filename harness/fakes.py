@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 from graderd.core.attitude import MeasuredAttitude
 from graderd.core.soil import SoilObservation
 from graderd.hal.clock import ManualClock
@@ -32,6 +34,7 @@ class FakeAxis:
         self.lifecycle = Lifecycle.STANDBY
         self.present: list[DeviceFault] = []
         self.refuse_arm: DeviceError | None = None
+        self.arm_takes_s = 0.0
         self.refuse_goal: DeviceError | None = None
         self.stuck = False
         self.silent_since_s: float | None = None
@@ -92,6 +95,8 @@ class FakeAxis:
         self.log.append(f"{self.name} open")
 
     async def arm(self) -> None:
+        if self.arm_takes_s:
+            await asyncio.sleep(self.arm_takes_s)
         if self.refuse_arm is not None:
             raise self.refuse_arm
         self._require(Lifecycle.STANDBY)

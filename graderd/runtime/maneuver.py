@@ -19,7 +19,6 @@ from graderd.runtime.control import ControlLoop
 CLIENT = "maneuver"
 SAMPLE_S = 0.02
 RENEW_S = 0.1
-ARM_TIMEOUT_S = 10.0
 
 
 class Maneuver:
@@ -43,14 +42,17 @@ class Maneuver:
         return self
 
     async def _armed(self) -> None:
-        try:
-            async with asyncio.timeout(ARM_TIMEOUT_S):
-                while (state := self._loop.tick.state).mode is not Mode.MANUAL:
-                    if state.arming_since_s is None:
-                        raise DeviceRefusedError("arm", state.reason)
-                    await asyncio.sleep(SAMPLE_S)
-        except TimeoutError:
-            raise DeviceRefusedError("arm", f"not armed within {ARM_TIMEOUT_S:g} s") from None
+        """Wait for as long as the machine does: it alone gives up (``machine.arm_timeout_s``), and then arms nothing.
+        Who gave up before it would leave behind a machine that becomes armed, with nobody there."""
+        while True:
+            state = self._loop.tick.state
+            if state.arming_since_s is None:
+                break
+            await asyncio.sleep(SAMPLE_S)
+        if state.mode is Mode.AUTO:  # somebody asked for it meanwhile: not with what was armed for this
+            await self._loop.command(cmd.Disarm(client=CLIENT))
+        if state.mode is not Mode.MANUAL:
+            raise DeviceRefusedError("arm", state.reason)
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -12,11 +12,13 @@ import struct
 import sys
 import termios
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from graderd import places
+from graderd.cli import modes
 from graderd.cli.app import run_app
 from graderd.cli.status import sections
 from graderd.core.machine import Mode, Unmet
@@ -52,6 +54,23 @@ async def test_from_disarmed_to_auto_and_stopped(tmp_path: Path, capsys: Capture
         assert daemon.status().mode is Mode.DISARMED
         assert await cli(path, "manual") == 1
         assert await cli(path, "disarm") == 0
+
+
+def test_arm_waits_for_as_long_as_the_daemon_arms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It failed after 8 s, with arming going on: the machine became armed after a command that had failed."""
+    waited_s = 0.0
+
+    def wait(seconds: float) -> None:
+        nonlocal waited_s
+        waited_s += seconds
+
+    def status(_: str) -> dict[str, Any]:
+        armed = waited_s > 29.0
+        return {"mode": "manual" if armed else "disarmed", "arming": not armed, "reason": "arming"}
+
+    monkeypatch.setattr(modes, "time", SimpleNamespace(monotonic=lambda: waited_s, sleep=wait))
+    client: Any = SimpleNamespace(get=status)
+    assert modes._after_arming(client)["mode"] == "manual"
 
 
 async def test_arm_lists_what_is_unmet(tmp_path: Path, capsys: Capture) -> None:

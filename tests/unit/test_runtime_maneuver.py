@@ -39,14 +39,14 @@ def in_simulated_time(test: Callable[..., Coroutine[Any, Any, None]]) -> Callabl
 
 
 @asynccontextmanager
-async def running(tmp_path: Path) -> AsyncIterator[tuple[FakeMachine, ControlLoop]]:
+async def running(tmp_path: Path, config: Config | None = None) -> AsyncIterator[tuple[FakeMachine, ControlLoop]]:
     """A control loop ticking over fake devices, in the time of the event loop it runs on."""
     machine = FakeMachine()
     clock = asyncio.get_running_loop()
     assert isinstance(clock, SimulatedLoop)
     for device in (machine.rotation, machine.lift_left, machine.lift_right, machine.tilt):
         device.clock = clock  # type: ignore[assignment]  # the fakes only read it
-    loop = ControlLoop(Config(), machine.devices, machine.eyes, clock, StateFile(str(tmp_path)))
+    loop = ControlLoop(config or Config(), machine.devices, machine.eyes, clock, StateFile(str(tmp_path)))
     task = asyncio.create_task(loop.run(), name="control-tick")
     try:
         yield machine, loop
@@ -162,6 +162,48 @@ async def test_an_arming_that_fails_says_why(tmp_path: Path) -> None:
         with pytest.raises(DeviceRefusedError, match="limits did not read back"):
             await turn(loop, 5.0)
         assert machine.rotation.position == 0.0
+
+
+@pytest.mark.parametrize(("takes_s", "armed"), [(12.0, True), (29.0, True), (40.0, False)])
+@in_simulated_time
+async def test_it_waits_for_as_long_as_arming_may_take(tmp_path: Path, takes_s: float, armed: bool) -> None:
+    """It gave up after 10 s, and the machine was armed two seconds later with nobody there."""
+    config = Config.model_validate({"machine": {"arm_timeout_s": 30.0}})
+    async with running(tmp_path, config) as (machine, loop):
+        machine.rotation.arm_takes_s = takes_s
+        if armed:
+            await turn(loop, 5.0)
+            assert machine.rotation.position == pytest.approx(5.0)
+        else:
+            with pytest.raises(DeviceRefusedError, match="longer than 30 s"):
+                await turn(loop, 5.0)
+        over_s = loop.tick.now_s + 40.0
+        while loop.tick.now_s < over_s:
+            assert loop.tick.state.mode is Mode.DISARMED
+            assert loop.tick.state.arming_since_s is None
+            await asyncio.sleep(0.1)
+        assert machine.rotation.lifecycle is Lifecycle.STANDBY
+
+
+@in_simulated_time
+async def test_automatic_operation_that_somebody_asks_for_while_it_arms_is_not_what_was_armed_for(
+    tmp_path: Path,
+) -> None:
+    async with running(tmp_path) as (_, loop):
+        asked: list[asyncio.Future[cmd.Reply]] = []
+
+        def ask_in_the_tick_that_armed() -> None:
+            """Before the maneuver sees that it is armed."""
+            if loop.tick.state.mode is Mode.MANUAL and not asked:
+                asked.append(asyncio.get_running_loop().create_future())
+                loop._queue.append((cmd.Auto(client="cab"), asked[0]))
+                loop.run_tick()
+
+        loop.on_tick = ask_in_the_tick_that_armed
+        with pytest.raises(DeviceRefusedError, match="automatic operation"):
+            await turn(loop, 5.0)
+        assert (await asked[0]).accepted
+        assert loop.tick.state.mode is Mode.DISARMED
 
 
 def port_of(machine: FakeMachine, loop: ControlLoop) -> Port:
