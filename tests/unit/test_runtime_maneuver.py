@@ -85,18 +85,26 @@ async def test_a_step_response_goes_half_way_from_both_sides_and_comes_back(tmp_
         assert loop.tick.state.mode is Mode.DISARMED
 
 
+@pytest.mark.parametrize("sample", [22, 23])
 @in_simulated_time
-async def test_stop_ends_it_under_way(tmp_path: Path) -> None:
+async def test_stop_ends_it_under_way(tmp_path: Path, sample: int) -> None:
+    """At once, wherever between two renewals of its lease the stop comes: not when the next one is refused."""
     async with running(tmp_path) as (machine, loop):
+        samples_n = after_n = 0
 
         def step_in() -> None:
-            if machine.rotation.position > 2.0:
+            nonlocal samples_n, after_n
+            samples_n += 1
+            after_n += loop.tick.state.mode is Mode.STOPPED
+            if samples_n == sample:
+                assert machine.rotation.position > 2.0
                 loop.stop_now(cmd.Stop(reason="person near the blade"))
 
         with pytest.raises(DeviceLostError, match="person near the blade"):
             async with Maneuver(loop) as blade:
                 await blade.rotate_to(40.0, 30.0, step_in)
         assert loop.tick.state.mode is Mode.STOPPED
+        assert after_n == 0
 
 
 @pytest.mark.parametrize("why", ["a fault", "no measurement"])
