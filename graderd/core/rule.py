@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.settings import Finite, NotNegative, Positive, Settings
 
+ROUNDING_M = 1e-6
 TURNING_ZONES = (Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN)
 
 
@@ -41,13 +42,19 @@ class RuleSettings(Settings):
         0.03, le=0.2, description="slower counts as standing; wheel speed reads to 0.001 m/s and few senders below 0.02"
     )
     standing_s: NotNegative = Field(
-        0.5, le=10, description="standing so long ends the pass; a wheel that slips or a gear change ends none"
+        0.5,
+        le=10,
+        description="standing or reversing so long ends the pass; a wheel that slips, a gear change or a wrong reading"
+        " ends none",
     )
     pass_m: Positive = Field(
         10.0, le=200, description="a pass ends after so much travel: another 8 m bed begins, or the site goes on and on"
     )
     pass_s: Positive = Field(
-        32.0, le=600, description="without speed or travel, after so much time: 8 m at 0.25 m/s, the slowest work"
+        32.0,
+        le=600,
+        description="without speed or travel, after so much time: 8 m at 0.25 m/s, the slowest work; while they are"
+        " not known, pass_m in so much time is taken to be driven, or as fast as last known where that was faster",
     )
 
     @model_validator(mode="after")
@@ -70,11 +77,12 @@ class RuleSettings(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Travel:
-    """How the machine drives: forward is positive. ``travelled_m`` counts from anywhere; only differences mean
-    something. A speed without a sign (J1939) cannot tell reverse."""
+    """How the machine drove at ``time_s``: forward is positive. ``travelled_m`` counts from anywhere; only differences
+    mean something. A speed without a sign (J1939) cannot tell reverse."""
 
     speed_m_per_s: float
     travelled_m: float
+    time_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +93,9 @@ class Decision:
     the next one. ``begun``: the machine drives, or may (it does not say), so that the decision is kept whatever
     is seen. ``angle_deg`` None with a zone: a hold took the angle away, and the pass goes on.
 
-    ``at_m``: what the machine's count of travel was at the decision, None where it does not say; ``since_m``: travelled
-    since, as far as it said, None: it never did. ``silent_since_s``: since when it has not said how it drives.
+    ``since_m``: travelled since, up to ``counted_s``: what the machine said, and what it may have driven while it said
+    nothing. ``told``: what it said last in this pass, None: nothing; ``silent``: it does not say now.
+    ``standing_since_s``, ``reversing_since_s``: the first reading of those that said so, one after the other.
     """
 
     zone: Zone | None = None
@@ -95,10 +104,12 @@ class Decision:
     votes: tuple[SoilObservation, ...] = ()
     ended: str = ""
     begun: bool = False
-    at_m: float | None = None
-    since_m: float | None = None
-    silent_since_s: float | None = None
+    since_m: float = 0.0
+    counted_s: float = 0.0
+    told: Travel | None = None
+    silent: bool = True
     standing_since_s: float | None = None
+    reversing_since_s: float | None = None
 
     @property
     def kept(self) -> bool:
@@ -113,8 +124,7 @@ class Decision:
             return f"{self.zone}, until the next pass: {self.ended}"
         if not self.begun:
             return f"{self.zone}, before the pass"
-        told = self.silent_since_s is None and self.since_m is not None
-        since = f"{self.since_m:.1f} m" if told else f"{now_s - self.decided_s:.1f} s"
+        since = f"{now_s - self.decided_s:.1f} s" if self.silent else f"{self.since_m:.1f} m"
         held = "" if self.angle_deg is not None else "; held, until that is seen again"
         return f"{self.zone}, kept for this pass since {since}{held}"
 
@@ -147,15 +157,14 @@ def decide(
         return decision if decision.angle_deg is not None else replace(decision, angle_deg=rule.angle_deg(winner))
     if winner is None or now_s - decision.decided_s < rule.dwell_s:
         return decision
-    drives = travel is None or abs(travel.speed_m_per_s) >= rule.standing_m_per_s
     return Decision(
         zone=winner,
         angle_deg=rule.angle_deg(winner),
         decided_s=now_s,
-        begun=drives,
-        at_m=travel.travelled_m if travel else None,
-        since_m=0.0 if travel else None,
-        silent_since_s=None if travel else now_s,
+        begun=travel is None or _drives_on(travel, rule),
+        counted_s=travel.time_s if travel else now_s,
+        told=travel,
+        silent=travel is None,
     )
 
 
@@ -167,6 +176,10 @@ def interrupted(decision: Decision, now_s: float, rule: RuleSettings, travel: Tr
     if decision.kept and decision.begun:
         return replace(decision, angle_deg=None)
     return Decision(decided_s=decision.decided_s)
+
+
+def _drives_on(travel: Travel, rule: RuleSettings) -> bool:
+    return travel.speed_m_per_s >= rule.standing_m_per_s
 
 
 def _reverses(travel: Travel | None, rule: RuleSettings) -> bool:
@@ -188,42 +201,58 @@ def _pass(decision: Decision, agreeing: Agreeing, now_s: float, rule: RuleSettin
     if not decision.kept:
         return decision
     decision = _driven(decision, now_s, rule, travel)
-    stood_s = 0.0 if decision.standing_since_s is None else now_s - decision.standing_since_s
     ended, gone = "", agreeing.get(Zone.NONE, ())
-    if _reverses(travel, rule):
+    if _lasted_s(decision.reversing_since_s, travel) >= rule.standing_s:
         ended = "the machine reversed"
-    elif decision.begun and stood_s >= rule.standing_s:
+    elif decision.begun and _lasted_s(decision.standing_since_s, travel) >= rule.standing_s:
         ended = "the machine stands"
-    elif decision.since_m is not None and decision.since_m >= rule.pass_m:
-        ended = f"{rule.pass_m:g} m were travelled"
-    elif decision.silent_since_s is not None and now_s - decision.silent_since_s >= rule.pass_s:
-        ended = f"{rule.pass_s:g} s went by"
+    elif decision.since_m >= rule.pass_m - ROUNDING_M:
+        ended = f"{now_s - decision.decided_s:.0f} s went by" if travel is None else f"{rule.pass_m:g} m were travelled"
     elif gone and all(v.zone is Zone.NONE for v in gone):  # nor is any carried
         ended = "the soil is gone"
     # What was seen in one pass says nothing about the next.
-    return replace(decision, ended=ended, votes=(), standing_since_s=None) if ended else decision
+    return replace(decision, ended=ended, votes=()) if ended else decision
+
+
+def _lasted_s(since_s: float | None, travel: Travel | None) -> float:
+    """From the first to the newest of the readings that said so. One reading says it of one moment, however long no
+    other comes; nor is anything ended while nothing is said."""
+    return travel.time_s - since_s if since_s is not None and travel is not None else float("-inf")
 
 
 def _driven(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel | None) -> Decision:
+    """Count the travel. It goes on while the machine does not say: what is not known makes no pass longer."""
+    told = decision.told
+    known_m_per_s = told.speed_m_per_s if told is not None else 0.0
+    unknown_m_per_s = max(rule.pass_m / rule.pass_s, known_m_per_s)
     if travel is None:
-        # Not said any more, or never: kept, since it may drive; from here on the time counts.
-        if decision.silent_since_s is not None:
-            return decision
-        return replace(decision, begun=True, at_m=None, silent_since_s=now_s, standing_since_s=None)
-    at_m, since_m = decision.at_m, decision.since_m or 0.0
-    if at_m is None or travel.travelled_m < at_m + since_m:
-        at_m = travel.travelled_m - since_m  # it counts from somewhere else now, and the pass goes on
-    since_m = travel.travelled_m - at_m
-    drives = abs(travel.speed_m_per_s) >= rule.standing_m_per_s
-    standing_since_s = None if drives else decision.standing_since_s if decision.standing_since_s is not None else now_s
+        if now_s <= decision.counted_s:
+            return decision if decision.silent else replace(decision, silent=True, begun=True)
+        since_m = decision.since_m + unknown_m_per_s * (now_s - decision.counted_s)
+        return replace(decision, begun=True, silent=True, since_m=since_m, counted_s=now_s)
+    if travel == told and not decision.silent:
+        return decision
+    dt_s = max(0.0, travel.time_s - decision.counted_s)
+    if decision.silent or told is None:
+        step_m = unknown_m_per_s * dt_s
+    else:
+        # A count that stands still while it drives, or starts anew, counts for less than what it drove meanwhile.
+        step_m = max(travel.travelled_m - told.travelled_m, known_m_per_s * dt_s, 0.0)
     return replace(
         decision,
-        begun=decision.begun or drives,
-        at_m=at_m,
-        since_m=since_m,
-        silent_since_s=None,
-        standing_since_s=standing_since_s,
+        begun=decision.begun or _drives_on(travel, rule),
+        since_m=decision.since_m + step_m,
+        counted_s=max(decision.counted_s, travel.time_s),
+        told=travel,
+        silent=False,
+        standing_since_s=_since(decision.standing_since_s, travel, not _drives_on(travel, rule)),
+        reversing_since_s=_since(decision.reversing_since_s, travel, _reverses(travel, rule)),
     )
+
+
+def _since(former_s: float | None, travel: Travel, is_so: bool) -> float | None:
+    """The first of the readings in a row that say it is so; a silence between two of them does not break the row."""
+    return None if not is_so else travel.time_s if former_s is None else former_s
 
 
 def _winner(decision: Decision, agreeing: Agreeing, rule: RuleSettings) -> Zone | None:

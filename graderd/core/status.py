@@ -105,9 +105,9 @@ class SoilStatus(_Status):
 
 
 class DecisionStatus(_Status):
-    """What automatic operation decided last. ``kept``: it stands for a pass that is not over, for ``since_m`` so far
-    as it told its travel (null where it never did). ``angle_deg`` null with a zone: a hold took it away in mid-pass.
-    ``decisions_n``: since the daemon's start."""
+    """What automatic operation decided last. ``kept``: it stands for a pass that is not over, for ``since_m`` so far,
+    with what the machine may have driven while it did not tell (null where it never did). ``angle_deg`` null with a
+    zone: a hold took it away in mid-pass. ``decisions_n``: since the daemon's start."""
 
     zone: Zone | None = None
     angle_deg: float | None = None

@@ -360,8 +360,12 @@ def _samples(sensed: Sensed) -> Iterator[AxisSample]:
 
 
 def _travel(vehicle: VehicleTelemetry, now_s: float, max_age_s: float) -> Travel | None:
-    speed, travelled = (_fresh(reading, now_s, max_age_s) for reading in (vehicle.speed_m_per_s, vehicle.travelled_m))
-    return None if speed is None or travelled is None else Travel(speed, travelled)
+    """As old as the older of the two readings; what comes from ahead of the clock is of now, or it never grew old."""
+    speed, travelled = vehicle.speed_m_per_s, vehicle.travelled_m
+    speed_m_per_s, travelled_m = _fresh(speed, now_s, max_age_s), _fresh(travelled, now_s, max_age_s)
+    if speed is None or travelled is None or speed_m_per_s is None or travelled_m is None:
+        return None
+    return Travel(speed_m_per_s, travelled_m, min(speed.time_s, travelled.time_s, now_s))
 
 
 def _side(sensed: Sensed, axis: str) -> SideReading | None:

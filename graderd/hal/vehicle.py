@@ -15,6 +15,10 @@ class VehicleTelemetry:
     ``speed_m_per_s``: forward is positive; a source that cannot tell reverse gives it as positive too.
     ``travelled_m``: distance along the travel, backwards counted off where the source can tell; it counts from
     anywhere and starts again with its source, so only a difference between two fresh readings means something.
+
+    A reading may be wrong, and readings may come and go. So one reading ends nothing (what ends a pass has to be said
+    for ``rule.standing_s``), and what is not known lengthens nothing: while no fresh reading is there, ``rule`` counts
+    ``pass_m`` in ``pass_s``, or the last known speed where that was faster.
     """
 
     speed_m_per_s: Reading[float] | None = None

@@ -71,6 +71,7 @@ class RecordingFile:
         self._closed = False
         self.waiting_n = 0
         """Bytes since the last chunk; they become fewer by being written."""
+        self._summary_n = 0
         self._writer.start(profile="", library=f"graderd {head.get('version', '')}")
         self._writer.add_metadata(METADATA, dict(head))
         self._writer.add_attachment(0, 0, CONFIG, "application/json", config_json)
@@ -82,6 +83,11 @@ class RecordingFile:
     def size_n(self) -> int:
         """Bytes so far, without the chunk in progress."""
         return self._output.tell()
+
+    @property
+    def needed_n(self) -> int:
+        """The most that it will grow by if it is finished now: what waits, and a summary with each schema once more."""
+        return self.waiting_n + self._summary_n
 
     def is_there(self) -> bool:
         """Whether it still lies under its name: a file that somebody took away is begun anew."""
@@ -123,5 +129,7 @@ class RecordingFile:
         name, schema = schema_of(topic)
         if name not in self._schemas:
             self._schemas[name] = self._writer.register_schema(name, "jsonschema", schema)
+            self.waiting_n += len(schema)
+            self._summary_n += len(schema)
         self._channels[topic] = self._writer.register_channel(topic, "json", self._schemas[name])
         return self._channels[topic]

@@ -371,7 +371,7 @@ class _Files:
     def _write_out(self) -> None:
         open_files = [file for file in (self._run, self._box) if file is not None]
         kept = {path for file in open_files for path in (file.path, _frames_of(file.path))}
-        self.store.make_room(sum(file.waiting_n for file in open_files), kept)
+        self.store.make_room(sum(file.needed_n for file in open_files), kept)
         for file in open_files:
             file.flush()
 

@@ -68,7 +68,7 @@ def build_status(
             angle_deg=decision.angle_deg,
             age_s=now_s - decision.decided_s if decision.zone is not None else None,
             kept=decision.kept,
-            since_m=decision.since_m,
+            since_m=None if decision.told is None else decision.since_m,
             reason=decision.reason(now_s),
             decisions_n=loop.decisions_n,
         ),

@@ -127,7 +127,7 @@ def automatic_answers() -> Iterator[tuple[str, Any]]:
         shares = (0.9, 0.0, 0.0) if left else (0.0, 0.0, 0.9)
         seen = SoilObservation(now_s, Zone.LEFT if left else Zone.RIGHT, 0.9, "", *shares)
         settled = tick not in range(6, 9)
-        travel = Travel(0.0, 3.0)
+        travel = Travel(0.0, 3.0, now_s)
         result = do(state, now_s=now_s, observation=seen, travel=travel, settled=settled, devices_active=True)
         state = result.state
         yield f"automatic, tick {tick}", [told(result), len(state.decision.votes)]

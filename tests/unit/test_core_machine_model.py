@@ -119,7 +119,8 @@ def canonical(state: State, passed_s: float) -> State:
         decision=replace(
             state.decision,
             decided_s=relative(state.decision.decided_s),
-            silent_since_s=None if state.decision.silent_since_s is None else relative(state.decision.silent_since_s),
+            since_m=round(state.decision.since_m, 6),
+            counted_s=relative(state.decision.counted_s),
             votes=votes,
         ),
     )

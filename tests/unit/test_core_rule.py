@@ -13,7 +13,7 @@ from graderd.core.rule import Decision, RuleSettings, Travel, decide
 from graderd.core.soil import SoilAhead, SoilObservation, Thirds, Zone
 
 RULE = RuleSettings()
-STANDING = Travel(0.0, 0.0)
+STANDING = Travel(0.0, 0.0, 0.0)
 SPREAD = (12.0, 20.0, 12.0)
 """A carried heap, litres, spread over the whole blade as every heap is within a metre."""
 SHARES = {
@@ -56,7 +56,8 @@ def run(
     decision = start or Decision()
     for index, zone in enumerate(zones):
         now_s = start_s + index * step_s
-        decision = decide(decision, seen(zone, now_s), settled=True, now_s=now_s, rule=RULE, travel=travel)
+        told = travel and replace(travel, time_s=now_s)
+        decision = decide(decision, seen(zone, now_s), settled=True, now_s=now_s, rule=RULE, travel=told)
     return decision
 
 
@@ -72,7 +73,7 @@ def drive(
     now_s, travelled_m = at
     for _ in range(round(metres / speed / 0.066)):
         now_s, travelled_m = now_s + 0.066, travelled_m + 0.066 * speed
-        decision = decide(decision, apart(ahead, carried, now_s), True, now_s, RULE, Travel(speed, travelled_m))
+        decision = decide(decision, apart(ahead, carried, now_s), True, now_s, RULE, Travel(speed, travelled_m, now_s))
     return decision, (now_s, travelled_m)
 
 
@@ -82,7 +83,7 @@ def stand(
     now_s, travelled_m = at
     for _ in range(round(seconds / 0.066)):
         now_s += 0.066
-        decision = decide(decision, apart(ahead, (0, 0, 0), now_s), True, now_s, RULE, Travel(0.0, travelled_m))
+        decision = decide(decision, apart(ahead, (0, 0, 0), now_s), True, now_s, RULE, Travel(0.0, travelled_m, now_s))
     return decision, (now_s, travelled_m)
 
 
@@ -143,11 +144,15 @@ def test_a_change_needs_a_clear_share() -> None:
     decision = first
     for index in range(10):
         at_s = now_s + index * 0.066
-        decision = decide(decision, seen(Zone.CENTER, at_s, shares=(0.35, 0.6, 0.05)), True, at_s, RULE, STANDING)
+        decision = decide(
+            decision, seen(Zone.CENTER, at_s, shares=(0.35, 0.6, 0.05)), True, at_s, RULE, Travel(0.0, 0.0, at_s)
+        )
     assert decision.zone is Zone.LEFT
     for index in range(10):
         at_s = now_s + 2 + index * 0.066
-        decision = decide(decision, seen(Zone.CENTER, at_s, shares=(0.15, 0.8, 0.05)), True, at_s, RULE, STANDING)
+        decision = decide(
+            decision, seen(Zone.CENTER, at_s, shares=(0.15, 0.8, 0.05)), True, at_s, RULE, Travel(0.0, 0.0, at_s)
+        )
     assert decision.zone is Zone.CENTER
 
 
@@ -160,7 +165,7 @@ def test_never_more_often_than_the_dwell_allows(told: list[tuple[Zone, float | N
     for index, (zone, speed) in enumerate(told):
         now_s = index * 0.066
         travelled_m += 0.066 * (speed or 0.0)
-        travel = None if speed is None else Travel(speed, travelled_m)
+        travel = None if speed is None else Travel(speed, travelled_m, now_s)
         new = decide(decision, seen(zone, now_s, shares=(1.0, 1.0, 1.0)), True, now_s, RULE, travel)
         if new.zone is not decision.zone:
             times.append(now_s)
@@ -201,7 +206,7 @@ def test_even_follows_on_soil_ahead_that_lies_evenly_and_then_stays() -> None:
 
 
 def test_even_by_a_method_that_cannot_tell_what_is_carried_follows_on_nothing() -> None:
-    for travel in (None, STANDING, Travel(0.5, 3.0)):
+    for travel in (None, STANDING, Travel(0.5, 3.0, 0.0)):
         first = run([Zone.CENTER] * 6, travel=travel)
         assert run([Zone.EVEN] * 20, first, first.decided_s + 5.0, travel=travel).zone is Zone.CENTER
 
@@ -226,8 +231,46 @@ def test_a_machine_that_has_not_started_yet_does_not_end_the_pass_by_standing() 
 
 def test_the_pass_ends_when_the_machine_reverses() -> None:
     decision, at = drive(Decision(), Zone.LEFT)
-    decision = decide(decision, None, True, at[0] + 0.02, RULE, Travel(-0.2, at[1]))
+    decision, at = drive(decision, Zone.LEFT, metres=-0.2 * RULE.standing_s, speed=-0.2, at=at)
+    assert decision.kept
+    decision, at = drive(decision, Zone.LEFT, metres=-0.04, speed=-0.2, at=at)
     assert (decision.kept, decision.ended) == (False, "the machine reversed")
+
+
+@pytest.mark.parametrize("speed", [-0.3, 0.0])
+@pytest.mark.parametrize("begun", [True, False])
+def test_one_reading_of_the_speed_ends_no_pass(speed: float, begun: bool) -> None:
+    """The first negative one ended it, and one of standing that stayed the newest for half a second."""
+    decision, at = drive(Decision(), Zone.LEFT) if begun else stand(Decision(), Zone.LEFT, (100.0, 0.0), 1.0)
+    wrong = Travel(speed, at[1], at[0] + 0.02)
+    for number in range(1, 26):
+        decision = decide(decision, None, True, at[0] + 0.02 * number, RULE, wrong)
+        assert (decision.kept, decision.begun) == (True, begun)
+    # Nobody says more: what one reading said ends nothing then either.
+    decision = decide(decision, None, True, at[0] + 1.0, RULE, None)
+    assert decision.kept
+    decision = decide(decision, None, True, at[0] + 1.02, RULE, Travel(0.5, at[1] + 0.3, at[0] + 1.02))
+    assert (decision.kept, decision.standing_since_s, decision.reversing_since_s) == (True, None, None)
+
+
+@pytest.mark.parametrize(("speed", "ended"), [(0.0, "the machine stands"), (-0.3, "the machine reversed")])
+def test_a_speed_that_comes_and_goes_while_it_stands_or_reverses_ends_the_pass_no_later(
+    speed: float, ended: str
+) -> None:
+    decision, at = drive(Decision(), Zone.LEFT)
+    for number in range(8):
+        now_s = at[0] + 0.1 * number
+        travel = None if number % 2 else Travel(speed, at[1] + speed * 0.1 * number, now_s)
+        decision = decide(decision, None, True, now_s, RULE, travel)
+    assert (decision.kept, decision.ended) == (False, ended)
+
+
+def test_a_machine_that_creeps_to_and_fro_stands() -> None:
+    decision, at = drive(Decision(), Zone.LEFT)
+    for number in range(12):
+        now_s = at[0] + 0.05 * number
+        decision = decide(decision, None, True, now_s, RULE, Travel((0.0, -0.1)[number % 2], at[1], now_s))
+    assert decision.ended == "the machine stands"
 
 
 def test_the_pass_ends_when_the_soil_is_gone_and_not_while_some_is_carried() -> None:
@@ -263,10 +306,12 @@ def test_a_speed_that_is_lost_in_mid_pass_keeps_the_decision() -> None:
         now_s += 0.066
         decision = decide(decision, apart(Zone.RIGHT, SPREAD, now_s), True, now_s, RULE, None)
     assert decision.zone is Zone.LEFT
-    # Back again, counting from somewhere else: the pass goes on from what was known.
+    # Back again, counting from somewhere else: the pass goes on from what was known and what may have been driven.
     told_m = decision.since_m
-    decision = decide(decision, None, True, now_s + 0.02, RULE, Travel(0.5, 0.0))
-    assert (decision.kept, decision.since_m) == (True, told_m)
+    assert told_m == pytest.approx(0.5 * (now_s - decision.decided_s), abs=0.05)
+    decision = decide(decision, None, True, now_s + 0.02, RULE, Travel(0.5, 0.0, now_s + 0.02))
+    assert decision.kept
+    assert decision.since_m == pytest.approx(told_m + 0.01)
 
 
 def test_a_speed_that_is_lost_for_a_moment_late_in_a_slow_pass_keeps_the_decision() -> None:
@@ -275,10 +320,47 @@ def test_a_speed_that_is_lost_for_a_moment_late_in_a_slow_pass_keeps_the_decisio
     decision = decide(decision, None, True, at[0] + 0.02, RULE, None)
     decision, at = drive(decision, Zone.RIGHT, SPREAD, speed=0.2, at=at)
     assert (decision.zone, decision.kept) == (Zone.LEFT, True)
-    lost_s = at[0] + 0.02
-    decision = decide(decision, None, True, lost_s, RULE, None)
-    assert decide(decision, None, True, lost_s + RULE.pass_s - 0.1, RULE, None).kept
-    assert decide(decision, None, True, lost_s + RULE.pass_s, RULE, None).ended == "32 s went by"
+    # What is left of the pass goes by as it would in one of which nothing is told.
+    left_s = (RULE.pass_m - decision.since_m) * RULE.pass_s / RULE.pass_m
+    assert 3.0 < left_s < 4.0
+    assert decide(decision, None, True, at[0] + left_s - 0.1, RULE, None).kept
+    assert decide(decision, None, True, at[0] + left_s, RULE, None).ended == "48 s went by"
+
+
+@pytest.mark.parametrize("told_s", [0.02, 0.3, 1.0])
+@pytest.mark.parametrize("silent_s", [0.1, 0.6, 3.0])
+@pytest.mark.parametrize("counts_on", [True, False])
+@pytest.mark.parametrize("speed", [0.1, 0.5, 1.0])
+def test_a_speed_that_comes_and_goes_does_not_make_the_pass_longer(
+    told_s: float, silent_s: float, counts_on: bool, speed: float
+) -> None:
+    """While it was not told, neither travel nor time counted, and each time it was told again both began anew."""
+    decision, at = drive(Decision(), Zone.LEFT)
+    now_s, travelled_m, counted_m, told = at[0], at[1], at[1], Travel(0.5, at[1], at[0])
+    fastest = max(speed, RULE.pass_m / RULE.pass_s)
+    while decision.kept:
+        now_s, travelled_m, counted_m = now_s + 0.02, travelled_m + 0.02 * speed, counted_m + 0.02 * speed
+        is_told = (now_s - at[0]) % (told_s + silent_s) < told_s
+        if is_told and not counts_on and told.time_s < now_s - 0.03:
+            counted_m = 0.0
+        told = Travel(speed, counted_m, now_s) if is_told else told
+        # A reading is taken for what is for half a second, as the tick does.
+        fresh = told if now_s - told.time_s <= 0.5 else None
+        decision = decide(decision, None, True, now_s, RULE, fresh)
+        assert decision.since_m <= RULE.pass_m + 0.5
+        assert now_s - decision.decided_s <= RULE.pass_m / min(speed, RULE.pass_m / RULE.pass_s) + 1.0
+        assert travelled_m - 0.3 <= RULE.pass_m + 0.5 * fastest + 0.1, "as far as a pass of which all is told"
+
+
+def test_a_count_of_travel_that_stands_still_does_not_make_the_pass_longer() -> None:
+    decision, at = drive(Decision(), Zone.LEFT)
+    for number in range(1, 1200):
+        now_s = at[0] + 0.02 * number
+        decision = decide(decision, None, True, now_s, RULE, Travel(0.5, at[1], now_s))
+        if not decision.kept:
+            break
+    assert decision.ended == "10 m were travelled"
+    assert now_s - decision.decided_s == pytest.approx(20.0, abs=0.1)
 
 
 @pytest.mark.parametrize("lost", [True, False])
@@ -312,5 +394,5 @@ def test_as_many_votes_for_one_side_as_for_the_other_decide_nothing() -> None:
 def test_the_swing_of_the_blade_does_not_hide_the_end_of_the_pass() -> None:
     decision, at = drive(Decision(), Zone.LEFT)
     for number in range(60):
-        decision = decide(decision, None, False, at[0] + number * 0.02, RULE, Travel(0.0, at[1]))
+        decision = decide(decision, None, False, at[0] + number * 0.02, RULE, Travel(0.0, at[1], at[0] + number * 0.02))
     assert decision.ended == "the machine stands"

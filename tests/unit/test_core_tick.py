@@ -296,11 +296,11 @@ async def test_each_device_is_asked_once_a_tick_and_readiness_is_made_once(
 
 
 @pytest.mark.parametrize(
-    ("age_s", "travelled_m", "since_m"),
-    [(0.1, 7.0, 0.0), (0.6, 7.0, None), (0.1, math.nan, None), (0.1, math.inf, None)],
+    ("age_s", "travelled_m", "told"),
+    [(0.1, 7.0, True), (0.6, 7.0, False), (0.1, math.nan, False), (0.1, math.inf, False)],
 )
 def test_an_old_speed_is_none_and_so_is_a_distance_that_is_no_number(
-    age_s: float, travelled_m: float, since_m: float | None
+    age_s: float, travelled_m: float, told: bool
 ) -> None:
     """Then the time counts, not the travel."""
     controller, step = Controller(SETTINGS), partial(Sensed, powered=True)
@@ -313,7 +313,7 @@ def test_an_old_speed_is_none_and_so_is_a_distance_that_is_no_number(
         tick = controller.step(step(now_s, standing(now_s, HOME), commands=commands, observation=seen, vehicle=vehicle))
         if tick.state.decision.zone is not None:
             break
-    assert (tick.state.decision.zone, tick.state.decision.since_m) == (Zone.LEFT, since_m)
+    assert (tick.state.decision.zone, tick.state.decision.silent) == (Zone.LEFT, not told)
 
 
 def test_nobody_but_the_tick_calls_what_it_decides_with() -> None:
