@@ -92,7 +92,7 @@ def record_until_killed(folder: Path, after_s: float) -> float:
         ticked = process.stdout.read().split(b"\n")[:-1]  # what came after its last line end is no whole line
     last_s = float(ticked[-1]) if ticked else last_s
     (path,) = folder.glob("*.mcap")
-    kept_s = [float(said(message)["now_s"]) for message in Recording(path).messages((TICK,))]
+    kept_s = [float(said(message.data)["now_s"]) for message in Recording(path).messages((TICK,))]
     return last_s - (kept_s[-1] if kept_s else first_s)
 
 

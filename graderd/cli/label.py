@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from graderd.cli.console import CliError, ExitCode, Json, example, print_json, print_text
-from graderd.cli.record import tell_gaps
+from graderd.cli.record import tell_lacking
 from graderd.core.soil import Zone
 from graderd.hal.errors import DeviceError, ProtocolError
 
@@ -55,8 +55,7 @@ def register(app: typer.Typer) -> None:
         """
         from graderd.perception.frame_set import FrameSet
 
-        if to is not None:
-            make_frame_set(folder, to, config, blade_angle_deg)
+        is_whole = to is None or make_frame_set(folder, to, config, blade_angle_deg)
         try:
             labels = Labels(FrameSet(to or folder))
         except DeviceError as error:
@@ -74,22 +73,30 @@ def register(app: typer.Typer) -> None:
         else:
             told = ", ".join(f"{count} {zone}" for zone, count in sorted(counts.items())) or "none"
             print_text(f"labelled: {told}. The site's own figure: graderd classify {labels.folder}")
+        if not is_whole:
+            raise typer.Exit(ExitCode.FAILED)
 
 
-def make_frame_set(source: Path, folder: Path, config: Path | None, blade_angle_deg: float) -> None:
-    """A frame set of a recording's raw frames, or of a folder of pictures."""
+def make_frame_set(source: Path, folder: Path, config: Path | None, blade_angle_deg: float) -> bool:
+    """A frame set of a recording's raw frames, or of a folder of pictures; whether all there was is in it."""
     if folder.exists():
         raise CliError(str(folder), "is there already", "name a folder that is not", ExitCode.USAGE)
     if source.suffix == ".mcap":
+        from graderd.config import ConfigError
         from graderd.record.export import export_frames, gaps_of
         from graderd.record.reader import Recording
 
         recording = Recording(source)
-        tell_gaps(gaps_of(recording))
-        if export_frames(recording, folder) == 0:
+        try:
+            frames_n = export_frames(recording, folder)
+        except ConfigError as error:
+            raise CliError("", error.problems[0]) from None
+        tell_lacking(gaps_of(recording), recording.unreadable)
+        if frames_n == 0:
             raise CliError(str(source), "holds no raw frames", "record with graderd record start --raw full")
-        return
+        return not recording.unreadable
     _from_pictures(source, folder, config, blade_angle_deg)
+    return True
 
 
 def _from_pictures(source: Path, folder: Path, config: Path | None, blade_angle_deg: float) -> None:

@@ -28,7 +28,7 @@ from graderd.hal.errors import DeviceError
 
 if TYPE_CHECKING:
     from graderd.config import Config
-    from graderd.record.layout import Gap
+    from graderd.record.layout import Gap, Unreadable
     from graderd.record.store import Entry, Store
 
 ConfigFile = Annotated[
@@ -117,7 +117,8 @@ def _reading(group: typer.Typer) -> None:
     ) -> None:
         """Write a recording as ordinary files: table, pictures, wires, log, raw frames as a frame set.
 
-        recording.mcap in the folder is the same recording with an end and an index, also where it was cut off.
+        recording.mcap in the folder is the same recording with an end and an index, also where it was cut off. What is
+        not as graderd writes it is left out of the other files and told, each channel in a line: exit status 1.
         """
         from graderd.record.export import export as write
         from graderd.record.export import gaps_of
@@ -127,13 +128,15 @@ def _reading(group: typer.Typer) -> None:
             found = write(recording, to)
         except FileExistsError:
             raise CliError(str(to), "is there already", "name a folder that is not", ExitCode.USAGE) from None
-        gaps = gaps_of(recording)
-        tell_gaps(gaps)
+        gaps, unreadable = gaps_of(recording), recording.unreadable
+        tell_lacking(gaps, unreadable)
         if json:
-            print_json({"event": "exported", "folder": str(to), **found, "gaps": [gap.model_dump() for gap in gaps]})
+            print_json({"event": "exported", "folder": str(to), **found, **lacking(gaps, unreadable)})
         else:
             parts = ", ".join(f"{number} {name.removesuffix('_n').replace('_', ' ')}" for name, number in found.items())
             print_text(f"{to}: {parts}")
+        if unreadable:
+            raise typer.Exit(ExitCode.FAILED)
 
     @group.command(epilog=example("graderd record prune --keep-mb 500", "graderd record prune --older-days 30 --yes"))
     def prune(
@@ -202,10 +205,18 @@ def _running(group: typer.Typer) -> None:
             print_text("runs are recorded no more; the black box stays on")
 
 
-def tell_gaps(gaps: Iterable[Gap]) -> None:
+def tell_lacking(gaps: Iterable[Gap], unreadable: Iterable[Unreadable] = ()) -> None:
     """A line on stderr for each part of a recording that cannot be read."""
-    for gap in gaps:
-        typer.echo(error_line("", str(gap)), err=True)
+    for each in (*gaps, *unreadable):
+        typer.echo(error_line("", str(each)), err=True)
+
+
+def lacking(gaps: Iterable[Gap], unreadable: Iterable[Unreadable]) -> dict[str, Any]:
+    """The same for programs."""
+    return {
+        "gaps": [gap.model_dump() for gap in gaps],
+        "unreadable": [{**each.model_dump(), "text": str(each)} for each in unreadable],
+    }
 
 
 def state_of(told: dict[str, Any]) -> str:

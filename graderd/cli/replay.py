@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graderd.cli.console import CliError, ExitCode, Json, example, print_json, print_text
-from graderd.cli.record import path_of, tell_gaps
+from graderd.cli.record import path_of, tell_lacking
 
 if TYPE_CHECKING:
     from graderd.record.replay import Check, Difference
@@ -72,7 +72,7 @@ def _serve(path: Path, socket: Path, port: int | None, speed: float, from_s: flo
     from graderd.runtime.app import serve_recording
 
     recording = Recording(path)
-    tell_gaps(recording.gaps)
+    tell_lacking(recording.gaps)
 
     def ready(duration_s: float) -> None:
         if as_json:
@@ -87,7 +87,12 @@ def _serve(path: Path, socket: Path, port: int | None, speed: float, from_s: flo
         else:
             print_text(f"{path.name}, {duration_s:.0f} s: graderd --socket {socket} status; Ctrl-C ends it")
 
-    serve_recording(recording, socket, port, speed, from_s, ready)
+    try:
+        serve_recording(recording, socket, port, speed, from_s, ready)
+    finally:
+        tell_lacking((), recording.unreadable)
+    if recording.unreadable:
+        raise typer.Exit(ExitCode.FAILED)
 
 
 def _check(path: Path, config: Path | None, as_json: bool) -> None:
@@ -109,6 +114,8 @@ def _check(path: Path, config: Path | None, as_json: bool) -> None:
             print_json({"event": "not_compared", **asdict(replace(broken, gap=None)), "gap": gap})
         for lacking in found.picture_gaps:
             print_json({"event": "pictures_missing", "text": str(lacking), "gap": lacking.model_dump()})
+        for each in found.unreadable:
+            print_json({"event": "unreadable", **each.model_dump(), "text": str(each)})
         print_json(
             {
                 "event": "replay_finished",
@@ -118,6 +125,7 @@ def _check(path: Path, config: Path | None, as_json: bool) -> None:
                 "skipped_n": found.skipped_n,
                 "missing_n": sum(broken.missing_n or 0 for broken in found.breaks),
                 "breaks_n": len(found.breaks),
+                "unreadable_n": sum(max(1, each.messages_n) for each in found.unreadable),
                 "damaged": found.is_damaged,
                 "warm_ups_n": found.warm_ups_n,
             }
@@ -141,6 +149,7 @@ def _tell(found: Check) -> None:
         print_text(f"{broken.text}; ticks missing: {missing}; {broken.skipped_n} more not compared, {again}")
     if len(found.breaks) > SHOWN_N:
         print_text(f"... and {len(found.breaks) - SHOWN_N} more such places; --json prints all")
+    tell_lacking((), found.unreadable)
     for gap in found.picture_gaps:
         print_text(f"{gap}; for the ticks of these pictures stands what was seen then")
     frames = f" and {found.frames_n} raw frames" if found.frames_n else ""

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from graderd.cli.console import CliError, ExitCode, Json, example, print_json, print_text
-from graderd.cli.record import path_of, tell_gaps
+from graderd.cli.record import lacking, path_of, tell_lacking
 
 
 def register(app: typer.Typer) -> None:
@@ -25,6 +25,7 @@ def register(app: typer.Typer) -> None:
 
         Time in automatic, decisions with picture, litres and depth at that moment, angles and loads against time,
         faults, stops and why. index.html needs nothing else; ticks.csv, decisions.csv and faults.csv lie beside it.
+        Exit status 1 where something in it is not as graderd writes it: told, and left out.
         """
         # Heavy imports wait until the command really runs.
         from graderd.record.reader import Recording
@@ -43,9 +44,9 @@ def register(app: typer.Typer) -> None:
             "faults_n": len(story.faults),
             "stops_n": len(story.stops),
             "missing_s": round(story.missing_s, 3),
-            "gaps": [gap.model_dump() for gap in story.gaps],
+            **lacking(story.gaps, story.unreadable),
         }
-        tell_gaps(story.gaps)
+        tell_lacking(story.gaps, story.unreadable)
         if json:
             print_json({"event": "reported", **told})
         else:
@@ -53,3 +54,5 @@ def register(app: typer.Typer) -> None:
                 f"{to}/index.html: {told['duration_s']:.0f} s, {told['automatic_s']:.0f} s of it automatic, "
                 f"{told['decisions_n']} decisions, {told['faults_n']} faults, {told['stops_n']} stops and disarms"
             )
+        if story.unreadable:
+            raise typer.Exit(ExitCode.FAILED)

@@ -25,6 +25,7 @@ PICTURES = (".npy", ".png")
 CLOUDS = (".ply", ".las")
 RECORDING = ".mcap"
 EXTRA = "Install graderd[evaluation]"
+_EXPORTED = "Write out what is whole with graderd record export, and name the depth pictures that are meant"
 
 Edge = Literal["up", "down", "left", "right"]
 """An edge of the picture: where forward is."""
@@ -139,9 +140,8 @@ class Reader:
         first_s: float | None = None
         recording = Recording(path)
         for gap in gaps_of(recording):
-            remedy = "Write out what is whole with graderd record export, and name the depth pictures that are meant"
-            raise ProtocolError(str(path), str(gap), remedy)
-        for judged in raw_frames(recording):
+            raise ProtocolError(str(path), str(gap), _EXPORTED)
+        for message, judged in raw_frames(recording):
             frame = judged.frame
             first_s = frame.capture_s if first_s is None else first_s
             if span is not None and not span[0] <= frame.capture_s - first_s <= span[1]:
@@ -152,10 +152,16 @@ class Reader:
             try:
                 lens = Lens(**{name: getattr(told, name) for name in Lens.model_fields if hasattr(told, name)})
             except ValidationError as error:
-                raise ProtocolError(str(path), f"its depth camera: {error.errors()[0]['msg']}") from None
+                recording.refuse(message, error)
+                continue
             if lens not in self._recorded_rays:
                 self._recorded_rays[lens] = lens.rays()
-            found.append(self._back_projected(path, frame.depth_mm, lens, self._recorded_rays[lens]))
+            try:
+                found.append(self._back_projected(path, frame.depth_mm, lens, self._recorded_rays[lens]))
+            except ProtocolError as error:
+                recording.refuse(message, ValueError(error.cause))
+        for each in recording.unreadable:
+            raise ProtocolError(str(path), str(each), _EXPORTED)
         if not found:
             which = "" if span is None else f" from {span[0]:g} to {span[1]:g} s"
             raise ProtocolError(str(path), f"holds no raw depth{which}", "Record with graderd record start --raw full")

@@ -9,7 +9,7 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
-from graderd.record.layout import CONFIG, METADATA, Message, schema_of
+from graderd.record.layout import CHANNEL_NAMES, CONFIG, METADATA, Message, schema_of
 
 CHUNK_MOST_BYTES = 4 << 20
 
@@ -54,8 +54,8 @@ class _Output:
 
 class RecordingFile:
     """One file. ``head`` says where it comes from; it and the configuration stand before everything else. ``topics``:
-    channels that are named in its first chunk; others are where they are first used, and without a summary nobody knows
-    what they are once that chunk is damaged.
+    channels that are named there too; others are named in the chunk that first uses them, and where the file has no
+    summary, nobody knows what they are once that chunk is damaged.
 
     Every method that writes raises ``OSError``; then, and after :meth:`finish`, the file is closed and takes nothing
     more.
@@ -73,11 +73,13 @@ class RecordingFile:
         """Bytes since the last chunk; they become fewer by being written."""
         self._summary_n = 0
         self._writer.start(profile="", library=f"graderd {head.get('version', '')}")
-        self._writer.add_metadata(METADATA, dict(head))
-        self._writer.add_attachment(0, 0, CONFIG, "application/json", config_json)
-        self.flush()
         for topic in topics:
             self._register(topic)
+        self._writer.add_metadata(METADATA, dict(head))
+        # The library names them in the first chunk alone, and in the summary that a killed process does not write.
+        self._writer.add_metadata(CHANNEL_NAMES, {str(number): topic for topic, number in self._channels.items()})
+        self._writer.add_attachment(0, 0, CONFIG, "application/json", config_json)
+        self.flush()
 
     @property
     def size_n(self) -> int:

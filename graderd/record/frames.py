@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import itertools
 import queue
+import struct
 import sys
 import threading
 import time
@@ -19,12 +20,13 @@ import numpy as np
 
 from graderd.core.attitude import MeasuredAttitude
 from graderd.core.soil import SoilObservation
-from graderd.hal.camera import Frame
+from graderd.hal.camera import ColorImage, DepthImage, Frame
 from graderd.record.files import RecordingFile
 from graderd.record.layout import (
     COLOR,
     DEPTH,
     FRAME,
+    FRAME_CHANNELS,
     FRAMES_SUFFIX,
     MARK,
     FrameRecord,
@@ -35,11 +37,17 @@ from graderd.record.layout import (
     frame_of,
     image_message,
 )
+from graderd.record.reader import picture_data
+from graderd.record.table import MOST
 
 WAITING_N = 4
 """Frames that wait to be written; what comes beyond is left out, and counted."""
 FLUSH_S = 0.5
+PIXELS_MOST_N = 1 << 26
+"""What says it is larger is no camera's."""
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+_PNG_HEAD = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"
+_SIZE = struct.Struct(">II")
 
 
 class Judged(NamedTuple):
@@ -92,7 +100,8 @@ class FrameRecorder:
                 pass
 
     def _write_all(self) -> None:
-        file = RecordingFile(_free(Path(self.wanted.path)), self.wanted.head, self.wanted.config_json.encode())
+        head, config_json = self.wanted.head, self.wanted.config_json.encode()
+        file = RecordingFile(_free(Path(self.wanted.path)), head, config_json, FRAME_CHANNELS)
         offset_ns = time.time_ns() - time.monotonic_ns()
         due_s, lost_n = 0.0, 0
         while (judged := self._frames.get()) is not None:
@@ -148,29 +157,71 @@ def _png(picture: Any) -> str:
     return base64.b64encode(data.tobytes()).decode()
 
 
-def picture_of(data_base64: str) -> Any:
-    """The picture of an image message, as it was: BGR, or 16-bit depth.
+def color_of(message: bytes) -> ColorImage:
+    """The picture of a ``/camera/color``, as it was.
 
     Raises:
-        ValueError: it is no picture.
+        ValueError, LookupError: it is none.
     """
-    picture = cv2.imdecode(np.frombuffer(base64.b64decode(data_base64), np.uint8), cv2.IMREAD_UNCHANGED)
+    picture = _picture_of(message)
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
+        raise ValueError("a picture, but none of 8-bit colour")
+    return np.asarray(picture, dtype=np.uint8)
+
+
+def depth_of(message: bytes) -> DepthImage:
+    """The picture of a ``/camera/depth``, as it was: millimetres.
+
+    Raises:
+        ValueError, LookupError: it is none.
+    """
+    picture = _picture_of(message)
+    if picture.dtype != np.uint16 or picture.ndim != 2:
+        raise ValueError("a picture, but none of 16-bit depth")
+    return np.asarray(picture, dtype=np.uint16)
+
+
+def _picture_of(message: bytes) -> Any:
+    data = picture_data(message)
+    if not data.startswith(_PNG_HEAD) or len(data) < len(_PNG_HEAD) + _SIZE.size:
+        raise ValueError("not a PNG")
+    width_px, height_px = _SIZE.unpack_from(data, len(_PNG_HEAD))
+    if not 0 < width_px * height_px <= PIXELS_MOST_N:
+        raise ValueError(f"a picture of {width_px}x{height_px}")
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise ValueError(f"not a readable picture: {error.err}") from None
     if picture is None:
         raise ValueError("not a readable picture")
     return picture
 
 
-def judged_of(frame: bytes, color_base64: str, depth_base64: str | None) -> Judged:
-    """A recorded frame as it was judged.
+def circumstances_of(message: bytes) -> FrameRecord:
+    """What a frame was judged by, of a ``/camera/frame``.
 
     Raises:
-        ValueError: a part of it is damaged.
+        ValueError: it is none, or says what no camera and no blade can.
     """
-    record = frame_of(frame)
+    record = frame_of(message)
+    known = [record.capture_s, record.judged_s, record.angle_deg, record.observation.capture_s]
+    known += [value for value in (record.height_mm, record.slope_deg, record.pitch_deg) if value is not None]
+    for lens in (record.color_intrinsics, record.depth_intrinsics):
+        if lens is not None:
+            known += [lens.fx, lens.fy, lens.cx, lens.cy, *lens.coeffs]
+            if not (0 < lens.width * lens.height <= PIXELS_MOST_N and min(lens.width, lens.fx, lens.fy) > 0):
+                raise ValueError(f"a lens for {lens.width}x{lens.height}, {lens.fx:g} and {lens.fy:g} px long")
+    if not all(abs(value) < MOST for value in known):
+        raise ValueError("a number in it is no measurement")
+    return record
+
+
+def judged_of(record: FrameRecord, color: ColorImage, depth: DepthImage | None) -> Judged:
+    """A recorded frame as it was judged."""
     return Judged(
         Frame(
-            color_bgr=picture_of(color_base64),
-            depth_mm=None if depth_base64 is None else picture_of(depth_base64),
+            color_bgr=color,
+            depth_mm=depth,
             color_intrinsics=record.color_intrinsics,
             depth_intrinsics=record.depth_intrinsics,
             capture_s=record.capture_s,

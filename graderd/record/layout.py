@@ -21,9 +21,9 @@ from datetime import UTC, datetime
 from enum import Enum
 from functools import cache, lru_cache
 from types import MappingProxyType
-from typing import Any, Final, Literal, NamedTuple, get_type_hints
+from typing import Annotated, Any, Final, Literal, NamedTuple, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from typing_extensions import TypedDict
 
 from graderd.core import (
@@ -61,12 +61,17 @@ FRAME: Final = "/camera/frame"
 COLOR: Final = "/camera/color"
 DEPTH: Final = "/camera/depth"
 WIRE: Final = "/wire/"
-"""With the wire's name: ``/wire/can``, ``/wire/servo``."""
+"""With the wire's name."""
+WIRES: Final = ("can", "servo")
 
-CHANNELS: Final = (SENSED, TICK, MEMORY, MARK, LOG, TRANSFORM, PREVIEW)
-"""Of every run and incident, beside the wires."""
+CHANNELS: Final = (SENSED, TICK, MEMORY, MARK, LOG, TRANSFORM, PREVIEW, *(WIRE + name for name in WIRES))
+"""Of every run and incident."""
+FRAME_CHANNELS: Final = (FRAME, COLOR, DEPTH)
+"""Of raw frames."""
 
 METADATA: Final = "graderd"
+CHANNEL_NAMES: Final = "graderd.channels"
+"""Which topic each channel's number is, in the head."""
 CONFIG: Final = "config.json"
 
 PREFIX: Final = "graderd-"
@@ -83,6 +88,15 @@ class Message(NamedTuple):
     data: bytes
 
 
+Whole = Annotated[int, Field(ge=0, le=2**64 - 1)]
+"""A count, a place in a file or nanoseconds, as MCAP has them."""
+
+
+def clock(log_ns: int) -> str:
+    """A moment of a recording for people: UTC, to the millisecond."""
+    return datetime.fromtimestamp(log_ns / 1e9, UTC).strftime("%H:%M:%S.%f")[:-3]
+
+
 class Mark(BaseModel):
     """Something about the recording itself, or a word that somebody put there.
 
@@ -96,7 +110,7 @@ class Mark(BaseModel):
     kind: Literal["note", "incident", "lost", "ended"]
     text: str = ""
     client: str = ""
-    lost_n: int = 0
+    lost_n: Whole = 0
 
 
 class Gap(BaseModel):
@@ -108,12 +122,12 @@ class Gap(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    file: str
-    chunk_n: int
-    first_byte_n: int
-    bytes_n: int
-    from_ns: int | None = None
-    to_ns: int | None = None
+    file: Annotated[str, Field(min_length=1)]
+    chunk_n: Whole
+    first_byte_n: Whole
+    bytes_n: Whole
+    from_ns: Whole | None = None
+    to_ns: Whole | None = None
 
     @property
     def duration_s(self) -> float | None:
@@ -123,7 +137,7 @@ class Gap(BaseModel):
     def __str__(self) -> str:
         """For people."""
         ends = [
-            f"{word} {datetime.fromtimestamp(at_ns / 1e9, UTC).strftime('%H:%M:%S.%f')[:-3]}"
+            f"{word} {clock(at_ns)}"
             for word, at_ns in (("after", self.from_ns), ("before", self.to_ns))
             if at_ns is not None
         ]
@@ -131,6 +145,34 @@ class Gap(BaseModel):
         where = f"chunk {self.chunk_n}, bytes {self.first_byte_n} to {self.first_byte_n + self.bytes_n}"
         what = f"what was logged {' and '.join(ends)}{lasts}" if ends else "all there was"
         return f"{self.file}: damaged in {where}: {what} cannot be read"
+
+
+class Unreadable(BaseModel):
+    """Messages of one channel that are not as graderd writes them: they are left out, what is around them is read.
+
+    ``topic``: empty where it is a whole file that lies beside a recording. ``first_ns``: when the first of them was
+    logged. ``cause``: of the first. ``version``: in the file's head.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    file: str
+    topic: str
+    first_ns: int | None
+    messages_n: int
+    cause: str
+    version: str = ""
+
+    def __str__(self) -> str:
+        """For people."""
+        if self.first_ns is None:
+            return f"{self.file}: {self.cause}; it is left out. The rest is read without it"
+        more = f" and {self.messages_n - 1} more" if self.messages_n > 1 else ""
+        own = f"; graderd {self.version} reads its own" if self.version else ""
+        return (
+            f"{self.file}: {self.topic} at {clock(self.first_ns)}{more}: not as graderd writes it ({self.cause}), and "
+            f"left out. Another version or another program wrote it{own}"
+        )
 
 
 class Wire(BaseModel):

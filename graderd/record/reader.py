@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import os
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final, TypeVar
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -26,9 +27,10 @@ from pydantic import ValidationError
 
 from graderd.config import Config, ConfigError
 from graderd.config.loader import explain
-from graderd.hal.errors import DeviceMissingError, ProtocolError
-from graderd.record.layout import CONFIG, FRAMES_SUFFIX, GAP, METADATA, SUFFIX, Gap, Message
+from graderd.hal.errors import DeviceError, DeviceMissingError, ProtocolError
+from graderd.record.layout import CHANNEL_NAMES, CONFIG, FRAMES_SUFFIX, GAP, METADATA, SUFFIX, Gap, Message, Unreadable
 
+_T = TypeVar("_T")
 _MAGIC: Final = b"\x89MCAP0\r\n"
 _HEAD: Final = struct.Struct("<BQ")
 """Before each record: what it is, and how many bytes follow."""
@@ -70,8 +72,13 @@ class Recording:
             raise DeviceMissingError(str(path), "no such recording", "graderd record list shows which there are")
         self.head: Mapping[str, str] = {}
         self.config_json = b""
+        self._names: dict[int, str] = {}  # topics by number, by the head
+        self._refused: dict[str, tuple[str, list[int]]] = {}  # by topic: why the first was, and when each was logged
+        self._left_out: list[Unreadable] = []
         for _, record in self._records():
-            if isinstance(record, Metadata) and record.name == METADATA:
+            if isinstance(record, Metadata) and record.name == CHANNEL_NAMES:
+                self._names = {int(number): topic for number, topic in record.metadata.items() if number.isdecimal()}
+            elif isinstance(record, Metadata) and record.name == METADATA:
                 self.head = record.metadata
             elif isinstance(record, Attachment) and record.name == CONFIG:
                 self.config_json = record.data
@@ -109,7 +116,7 @@ class Recording:
 
     @property
     def _channels(self) -> dict[int, str]:
-        """Topics by number; empty where the file has no summary."""
+        """Topics by number, by the summary; empty where the file has none."""
         summary = self._summary
         return {} if summary is None else {number: channel.topic for number, channel in summary.channels.items()}
 
@@ -140,9 +147,59 @@ class Recording:
         return sorted(self.path.parent.glob(f"{stem}*{FRAMES_SUFFIX}"), key=lambda path: (len(path.name), path.name))
 
     @cached_property
+    def beside(self) -> tuple[Recording, ...]:
+        """Those files that are recordings; what is none (a process that was killed as it began one) is told as
+        unreadable."""
+        found = []
+        for path in self.frame_files:
+            try:
+                found.append(Recording(path))
+            except DeviceError as error:
+                self.leave_out(path.name, error.cause)
+        return tuple(found)
+
+    def value_of(self, message: Message, how: Callable[[bytes], _T]) -> _T | None:
+        """What ``how`` makes of a message; None where it is not as graderd writes it: told in :attr:`unreadable`."""
+        try:
+            return how(message.data)
+        except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+            self.refuse(message, error)
+            return None
+
+    def refuse(self, message: Message, why: Exception) -> None:
+        """A message is not as graderd writes it, by what came of it."""
+        _, times_ns = self._refused.setdefault(message.topic, (_words(why), []))
+        if message.log_ns not in times_ns[-1:]:
+            times_ns.append(message.log_ns)
+
+    def leave_out(self, file: str, cause: str) -> None:
+        """A part of it that is no message cannot be read."""
+        version = self.head.get("version", "")
+        self._left_out.append(
+            Unreadable(file=file, topic="", first_ns=None, messages_n=0, cause=cause, version=version)
+        )
+
+    @property
+    def unreadable(self) -> tuple[Unreadable, ...]:
+        """What of it and of its raw frames was found not to be as graderd writes it, by whatever was read so far."""
+        own = (
+            Unreadable(
+                file=self.path.name,
+                topic=" ".join(topic.split()),
+                first_ns=min(times_ns),
+                messages_n=len(set(times_ns)),
+                cause=cause,
+                version=self.head.get("version", ""),
+            )
+            for topic, (cause, times_ns) in self._refused.items()
+        )
+        return (*own, *self._left_out, *(each for other in self.beside for each in other.unreadable))
+
+    @cached_property
     def gaps(self) -> tuple[Gap, ...]:
         """What of it cannot be read, in its order; reads all of it. That it has no end is no gap."""
-        return tuple(Gap.model_validate_json(message.data) for message in self.messages((GAP,)))
+        told = (self.value_of(message, Gap.model_validate_json) for message in self.messages((GAP,)))
+        return tuple(gap for gap in told if gap is not None)
 
     def messages(self, topics: Collection[str] | None = None, from_ns: int = 0) -> Iterator[Message]:
         """In the file's order, up to its last whole chunk; ``topics`` None: of all channels. ``from_ns``: not those
@@ -156,6 +213,7 @@ class Recording:
         names = self._channels
         passes_over = bool(names) and from_ns > 0
         only_looks = bool(names) and topics is not None and set(topics) == {GAP} and GAP not in names.values()
+        names = self._names | names
         chunk_n, last_ns = 0, None
         lost: tuple[int, int] | None = None  # chunk and first byte of what could not be read
         is_damaged, to_n = False, self.path.stat().st_size
@@ -315,26 +373,37 @@ def _messages_in(
     return found
 
 
-def said(message: Message) -> dict[str, Any]:
-    """A message's JSON."""
-    found: dict[str, Any] = json.loads(message.data)
+def said(data: bytes) -> dict[str, Any]:
+    """A message's JSON.
+
+    Raises:
+        ValueError: it is none, or no object.
+    """
+    found = json.loads(data)
+    if not isinstance(found, dict):
+        raise ValueError("no JSON object")
     return found
 
 
-@contextmanager
-def as_written(recording: Recording, message: Message) -> Iterator[None]:
-    """What is read from a message within: graderd writes it so, whoever else wrote the file may not.
+def picture_data(data: bytes) -> bytes:
+    """The file in an image message.
 
     Raises:
-        ProtocolError: something was not there, or of another kind; says of which message.
+        ValueError, LookupError: there is none.
     """
-    try:
-        yield
-    except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
-        what = " ".join(str(error).split())[:120]
-        cause = f"{message.topic} at {message.log_ns / 1e9:.3f} s is not as graderd writes it ({what})"
-        remedy = "It is another version's, or another program's; the version in its head reads its own"
-        raise ProtocolError(str(recording.path), cause, remedy) from None
+    return base64.b64decode(said(data)["data"], validate=True)
+
+
+def _words(error: Exception) -> str:
+    """What is wrong with a message, in a line."""
+    if isinstance(error, ValidationError):
+        first, *_ = error.errors(include_url=False, include_context=False, include_input=False)
+        text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    elif isinstance(error, KeyError):
+        text = f"{error.args[0]!r} is missing"
+    else:
+        text = str(error) or type(error).__name__
+    return " ".join(text.split())[:120]
 
 
 @contextmanager

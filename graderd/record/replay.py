@@ -6,11 +6,13 @@ it is a what-if, as far as one can be: what was recorded does not answer to what
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, TypeVar
+
+import cv2
 
 from graderd.config import Config
 from graderd.config.tick import tick_settings
@@ -20,7 +22,7 @@ from graderd.core.soil import SoilObservation
 from graderd.core.tick import Controller, Sensed
 from graderd.hal.errors import ProtocolError
 from graderd.perception.classifier import judge_frame, make_classifier
-from graderd.record.export import frame_recordings, raw_frames
+from graderd.record.export import raw_frames
 from graderd.record.layout import (
     GAP,
     MARK,
@@ -31,6 +33,8 @@ from graderd.record.layout import (
     Mark,
     Memory,
     Message,
+    Unreadable,
+    clock,
     controller_of,
     memory_of,
     sensed_bytes,
@@ -38,8 +42,9 @@ from graderd.record.layout import (
     tick_bytes,
     tick_of,
 )
-from graderd.record.reader import Recording, as_written, said
+from graderd.record.reader import Recording, said
 
+_T = TypeVar("_T")
 WARM_UP_S: Final = 10.0
 """Where the tick's memory is another version's, it is made anew from the state recorded, and not judged for so long:
 faults have their debounce and votes their age by then."""
@@ -77,7 +82,8 @@ class Break:
     """Where ticks do not follow one another in the recording. What the tick had in mind is lost there: nothing is
     judged before the next memory, from which everything is bit for bit again.
 
-    ``kind``: ``damaged`` (the file cannot be read there) or ``lost`` (the daemon did not keep up, and said so).
+    ``kind``: ``damaged`` (the file cannot be read there), ``unreadable`` (a message is not as graderd writes it) or
+    ``lost`` (the daemon did not keep up, and said so).
     ``missing_n``: ticks that are not there, by the clock or as the daemon counted them; None: nobody knows.
     ``skipped_n``: ticks that are there, and were not judged. ``again_s``: the tick (monotonic) from which on they are
     judged again; None: none is. ``gap``: where in the file, of a damaged one.
@@ -94,7 +100,8 @@ class Break:
 @dataclass(slots=True)
 class Check:
     """What a check has found: ``ticks_n`` were decided again, ``skipped_n`` could not be (no memory to begin with).
-    ``picture_gaps``: what of the raw frames cannot be read; there stands what was seen then."""
+    ``picture_gaps``: what of the raw frames cannot be read; there stands what was seen then. ``unreadable``: what is
+    not as graderd writes it."""
 
     ticks_n: int = 0
     skipped_n: int = 0
@@ -103,11 +110,12 @@ class Check:
     differences: tuple[Difference, ...] = ()
     breaks: list[Break] = field(default_factory=list)
     picture_gaps: tuple[Gap, ...] = ()
+    unreadable: tuple[Unreadable, ...] = ()
 
     @property
     def is_damaged(self) -> bool:
         """Whether something of the recording could not be read."""
-        return bool(self.picture_gaps) or any(each.kind == "damaged" for each in self.breaks)
+        return bool(self.picture_gaps or self.unreadable) or any(each.kind == "damaged" for each in self.breaks)
 
 
 def check(recording: Recording, config: Config | None = None) -> Check:
@@ -115,14 +123,13 @@ def check(recording: Recording, config: Config | None = None) -> Check:
 
     Raises:
         ConfigError: the recording's configuration is not one any more.
-        ProtocolError: what the tick knew is not what today's tick could know.
     """
     found = Check()
     used = config or recording.config
     pictures, differences = _pictures(recording, used, found)
     differences += list(_merged(_decide(recording, used, found, pictures, follows=config is None)))
-    frames = [each for each in frame_recordings(recording) if each is not recording]
-    found.picture_gaps = tuple(gap for each in frames for gap in each.gaps)
+    found.picture_gaps = tuple(gap for each in recording.beside for gap in each.gaps)
+    found.unreadable = recording.unreadable
     found.differences = tuple(sorted(differences, key=lambda difference: difference.order))
     return found
 
@@ -137,16 +144,20 @@ def _pictures(
     today: dict[int, SoilObservation] = {}
     differences: list[Difference] = []
     classifier = make_classifier(config.perception, config.camera.calibration, config.blade, camera=config.camera)
-    for judged in raw_frames(recording):
-        seen = judge_frame(
-            classifier,
-            judged.frame,
-            judged.angle_deg,
-            judged.angle_age_s,
-            judged.judged_s,
-            config.perception.decision,
-            judged.attitude,
-        )
+    for message, judged in raw_frames(recording):
+        try:
+            seen = judge_frame(
+                classifier,
+                judged.frame,
+                judged.angle_deg,
+                judged.angle_age_s,
+                judged.judged_s,
+                config.perception.decision,
+                judged.attitude,
+            )
+        except (ValueError, LookupError, ArithmeticError, cv2.error) as error:  # no camera's picture
+            recording.refuse(message, error)
+            continue
         was = judged.observation
         # How long it took is no part of what was seen; the recorded time keeps what follows comparable.
         seen = replace(seen, cpu_ms=was.cpu_ms)
@@ -185,7 +196,7 @@ def _decide(
     rest of the day; a what-if goes its own way."""
     settings = tick_settings(config)
     controller: Controller | None = None
-    knew = b""
+    knew: Message | None = None
     warm_until_s = float("-inf")
     cold = False
     broken: list[Break] = []  # after which nothing was judged yet
@@ -195,64 +206,90 @@ def _decide(
         if broken:
             broken[-1].skipped_n += 1
 
+    def breaks(new: Break) -> None:
+        nonlocal controller, knew
+        if controller is not None or new.kind != "unreadable":
+            found.breaks.append(new)
+            broken.append(new)
+        controller = knew = None
+
     for message in recording.messages((SENSED, TICK, MEMORY, MARK, GAP)):
         if message.topic == SENSED:
-            knew = message.data
+            knew = message
         elif message.topic in (MARK, GAP):
-            with as_written(recording, message):
-                new = _break_at(message, config.control.tick_hz)
-            if new is not None:
-                found.breaks.append(new)
-                broken.append(new)
-                controller, knew = None, b""
+            new = recording.value_of(message, partial(_breaks_at, message.topic, config.control.tick_hz))
+            if new is None:
+                breaks(_unreadable(message))
+            elif new:
+                breaks(*new)
         elif message.topic == MEMORY:
             if controller is not None and not follows:
                 continue
-            with as_written(recording, message):
-                memory = Memory.model_validate_json(message.data)
+            if (memory := recording.value_of(message, Memory.model_validate_json)) is None:
+                continue
             try:
                 controller = controller_of(memory.controller, settings)
             except ValueError:
                 cold = controller is None
-        elif controller is None or not knew:
+        elif controller is None or knew is None:
             skipped()
-            if cold:  # the state of this tick is all there is to begin with
+            # The state of this tick is all there is to begin with.
+            now_s = recording.value_of(message, lambda data: float(said(data)["now_s"])) if cold else None
+            if now_s is not None:
                 controller, cold = Controller(settings, _state(message.data)), False
-                with as_written(recording, message):
-                    warm_until_s = float(said(message)["now_s"]) + WARM_UP_S
+                warm_until_s = now_s + WARM_UP_S
                 found.warm_ups_n += 1
         else:
-            try:
-                sensed = sensed_of(knew)
-                if not math.isfinite(sensed.now_s):
-                    raise ValueError(f"it was at {sensed.now_s} s")
-            except ValueError as error:
-                cause = f"what the tick knew is of another version ({str(error).splitlines()[0]})"
-                raise ProtocolError(str(recording.path), cause, "Replay it with the version in its head") from None
-            sensed = _seen_today(sensed, pictures, config)
-            told = tick_bytes(controller.step(sensed))
+            again = recording.value_of(knew, partial(_again, controller, pictures, config))
+            if again is None:
+                breaks(_unreadable(knew))
+                skipped()
+                continue
+            sensed, told = again
             if sensed.now_s < warm_until_s:
+                skipped()
+                continue
+            some = recording.value_of(message, partial(_differing, told, message.log_ns))
+            if some is None:
                 skipped()
                 continue
             found.ticks_n += 1
             for each in broken:
                 each.again_s = sensed.now_s
             broken.clear()
-            if told != message.data:
-                with as_written(recording, message):
-                    some = list(_differences(said(message), json.loads(told), message.log_ns))
-                # Counters and ages began anew where the memory did.
-                yield from (each for each in some if not (found.warm_ups_n and each.kind == "other"))
+            # Counters and ages began anew where the memory did.
+            yield from (each for each in some if not (found.warm_ups_n and each.kind == "other"))
 
 
-def _break_at(message: Message, tick_hz: float) -> Break | None:
-    """What a gap or mark says of missing ticks; None: nothing."""
-    if message.topic == GAP:
-        gap = Gap.model_validate_json(message.data)
+def _sensed(data: bytes) -> Sensed:
+    """What a tick knew, at a time that there is."""
+    sensed = sensed_of(data)
+    if not math.isfinite(sensed.now_s):
+        raise ValueError(f"it was at {sensed.now_s} s")
+    return sensed
+
+
+def _again(
+    controller: Controller, pictures: Mapping[int, SoilObservation], config: Config, data: bytes
+) -> tuple[Sensed, bytes]:
+    """What a tick knew, and what is decided of it today."""
+    sensed = _seen_today(_sensed(data), pictures, config)
+    return sensed, tick_bytes(controller.step(sensed))
+
+
+def _breaks_at(topic: str, tick_hz: float, data: bytes) -> list[Break]:
+    """What a gap or mark says of missing ticks: one, or none."""
+    if topic == GAP:
+        gap = Gap.model_validate_json(data)
         missing_n = None if gap.duration_s is None else max(0, round(gap.duration_s * tick_hz) - 1)
-        return Break("damaged", str(gap), missing_n, gap)
-    mark = Mark.model_validate_json(message.data)
-    return Break("lost", f"not recorded: {mark.text}", mark.lost_n) if mark.kind == "lost" else None
+        return [Break("damaged", str(gap), missing_n, gap)]
+    mark = Mark.model_validate_json(data)
+    return [Break("lost", f"not recorded: {mark.text}", mark.lost_n)] if mark.kind == "lost" else []
+
+
+def _unreadable(message: Message) -> Break:
+    """A message that would say what was: one tick is missing at least."""
+    return Break("unreadable", f"{message.topic} at {clock(message.log_ns)} is not as graderd writes it", None)
 
 
 def _seen_today(sensed: Sensed, pictures: Mapping[int, SoilObservation], config: Config) -> Sensed:
@@ -267,6 +304,14 @@ def _state(tick: bytes) -> State | None:
         return tick_of(tick).state
     except ValueError:  # another version's
         return None
+
+
+def _differing(now: bytes, log_ns: int, was: bytes) -> list[Difference]:
+    """As :func:`_differences`, of a recorded tick."""
+    found = [] if was == now else list(_differences(said(was), said(now), log_ns))
+    if not all(math.isfinite(each.size) for each in found):
+        raise ValueError("a number in it is none")
+    return found
 
 
 def _differences(was: dict[str, Any], now: dict[str, Any], log_ns: int) -> Iterator[Difference]:
@@ -347,7 +392,7 @@ def decided_again(recording: Recording) -> Iterator[Message]:
     Where the tick's memory is another version's, the first tick is kept as it was, and its state begun with.
 
     Raises:
-        ProtocolError: as :func:`check`, or ticks are missing in it.
+        ProtocolError: something in it is not as graderd writes it, or ticks are missing.
     """
     settings = tick_settings(recording.config)
     pictures, _ = _pictures(recording, recording.config, Check())
@@ -355,15 +400,21 @@ def decided_again(recording: Recording) -> Iterator[Message]:
     sensed: Sensed | None = None
     cold = False
 
+    def value_of(message: Message, how: Callable[[bytes], _T]) -> _T:
+        found = recording.value_of(message, how)
+        if found is None:
+            raise ProtocolError(str(recording.path), str(recording.unreadable[0]))
+        return found
+
     def memory(now_s: float, of: Controller) -> bytes:
         return Memory(now_s=now_s, controller=memory_of(of, settings)).model_dump_json().encode()
 
     for message in recording.messages():
         if message.topic == SENSED:
-            sensed = _seen_today(sensed_of(message.data), pictures, recording.config)
+            sensed = _seen_today(value_of(message, _sensed), pictures, recording.config)
             yield message._replace(data=sensed_bytes(sensed))
         elif message.topic == MEMORY:
-            told = Memory.model_validate_json(message.data)
+            told = value_of(message, Memory.model_validate_json)
             if controller is None:
                 try:
                     controller = controller_of(told.controller, settings)
@@ -371,7 +422,7 @@ def decided_again(recording: Recording) -> Iterator[Message]:
                     cold = True
                     continue
             yield message._replace(data=memory(told.now_s, controller))
-        elif message.topic in (MARK, GAP) and _break_at(message, recording.config.control.tick_hz) is not None:
+        elif message.topic in (MARK, GAP) and value_of(message, partial(_breaks_at, message.topic, 0.0)):
             cause = "ticks are missing in it, so that nobody knows what today would be decided after them"
             raise ProtocolError(str(recording.path), cause, "Make a reference of a recording that is whole")
         elif message.topic == TICK and sensed is not None and controller is not None:

@@ -17,8 +17,8 @@ import numpy as np
 from graderd.core.faults.catalogue import CATALOGUE
 from graderd.core.faults.monitor import catalogue_key
 from graderd.record.export import gaps_of, raw_frames
-from graderd.record.layout import MARK, PREVIEW, Gap, Mark
-from graderd.record.reader import Recording, as_written, new_folder, said
+from graderd.record.layout import MARK, PREVIEW, Gap, Mark, Unreadable
+from graderd.record.reader import Recording, new_folder, picture_data
 from graderd.record.table import Row, rows, write_csv
 
 PICTURE_WITHIN_S: Final = 2.0
@@ -76,6 +76,7 @@ class Story:
     ticks_n: int = 0
     missing_s: float = 0.0
     gaps: list[Gap] = field(default_factory=list)
+    unreadable: tuple[Unreadable, ...] = ()
     modes: list[Span] = field(default_factory=list)
     faults: list[Span] = field(default_factory=list)
     decisions: list[Decided] = field(default_factory=list)
@@ -181,13 +182,13 @@ def write(recording: Recording, folder: Path) -> Story:
     Raises:
         FileExistsError: the folder is there already.
         OSError: it cannot be written; nothing of it is left.
-        ProtocolError: the recording holds what graderd does not write.
     """
     with new_folder(folder):
         story, told = tell(recording)
         story.gaps = gaps_of(recording)
         write_csv(folder / "ticks.csv", told)
         _add_pictures(recording, story)
+        story.unreadable = recording.unreadable
         _table_csv(folder / "decisions.csv", _DECISION_COLUMNS, map(_decision_cells, story.decisions))
         _table_csv(
             folder / "faults.csv",
@@ -204,18 +205,19 @@ def _add_pictures(recording: Recording, story: Story) -> None:
     for message in recording.messages((PREVIEW, MARK)):
         at_s = message.log_ns / 1e9 - story.began_s
         if message.topic == MARK:
-            with as_written(recording, message):
-                mark = Mark.model_validate_json(message.data)
+            if (mark := recording.value_of(message, Mark.model_validate_json)) is None:
+                continue
             text = " ".join(filter(None, (mark.kind, mark.text, mark.client)))
             story.notes.append(Span(mark.kind, at_s, at_s, text))
             continue
         for number, decision in enumerate(story.decisions):
             apart_s = abs(at_s - decision.at_s)
-            if apart_s <= min(PICTURE_WITHIN_S, nearest.get(number, PICTURE_WITHIN_S)):
-                with as_written(recording, message):
-                    nearest[number], decision.picture = apart_s, said(message)["data"]
+            if apart_s > min(PICTURE_WITHIN_S, nearest.get(number, PICTURE_WITHIN_S)):
+                continue
+            if (picture := recording.value_of(message, picture_data)) is not None:
+                nearest[number], decision.picture = apart_s, base64.b64encode(picture).decode()
     nearest.clear()
-    for judged in raw_frames(recording):
+    for _, judged in raw_frames(recording):
         depth = judged.frame.depth_mm
         for number, decision in enumerate(story.decisions):
             apart_s = abs(judged.frame.capture_s - decision.row["now_s"])
@@ -293,7 +295,7 @@ def page(recording: Recording, story: Story) -> str:
                 **({"missing within": f"{_duration(story.missing_s)}, in no sum below"} if story.missing_s else {}),
             }
         ),
-        *(f"<p class=missing>{escape(str(gap))}</p>" for gap in story.gaps),
+        *(f"<p class=missing>{escape(str(each))}</p>" for each in (*story.gaps, *story.unreadable)),
         "<h2>Modes</h2>",
         _strip(story),
         _rows(

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 from graderd.core.axes import AXES, UNITS
-from graderd.record.layout import GAP, MARK, SENSED, TICK
-from graderd.record.reader import Recording, as_written, said
+from graderd.record.layout import GAP, MARK, SENSED, TICK, Mark
+from graderd.record.reader import Recording, said
 
 Row = Mapping[str, Any]
+MOST: Final = 1e12
+"""No measurement is so great, in any unit."""
 AXIS_COLUMNS: Final = tuple(
     f"{axis}_{name}"
     for axis in AXES
@@ -36,71 +39,111 @@ COLUMNS: Final = (
 
 def rows(recording: Recording) -> Iterator[Row]:
     """Every tick, oldest first; what was not known is absent. ``missing_before_s``: where ticks before it are missing,
-    how long it is since the last one.
-
-    Raises:
-        ProtocolError: a message is not as graderd writes it.
+    how long it is since the last one. What is not as graderd writes it is in ``recording.unreadable`` then.
     """
-    sensed: dict[str, Any] = {}
+    sensed: dict[str, Any] | None = None
     last_ns: int | None = None
     breaks = False
     for message in recording.messages((SENSED, TICK, MARK, GAP)):
-        row: dict[str, Any] | None = None
-        with as_written(recording, message):
-            told = said(message)
-            if message.topic == SENSED:
-                sensed = told
-            elif message.topic != TICK:
-                breaks = breaks or message.topic == GAP or told["kind"] == "lost"
-            elif sensed.get("now_s") == told.get("now_s"):
-                row = _row(message.log_ns, sensed, told)
+        if message.topic == SENSED:
+            sensed = recording.value_of(message, _sensed)
+        elif message.topic == TICK:
+            tick = recording.value_of(message, _tick)
+            if sensed is None or tick is None:
+                breaks = True
+            elif sensed["now_s"] == tick["now_s"]:
+                wall_time = datetime.fromtimestamp(message.log_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+                row = {"wall_time": wall_time, **sensed, **tick}
                 if breaks and last_ns is not None:
                     row["missing_before_s"] = round((message.log_ns - last_ns) / 1e9, 3)
                 last_ns, breaks = message.log_ns, False
-        if row is not None:
-            yield row
+                yield {name: value for name, value in row.items() if value is not None}
+        elif message.topic == GAP:
+            breaks = True
+        else:
+            mark = recording.value_of(message, Mark.model_validate_json)
+            breaks = breaks or mark is None or mark.kind == "lost"
 
 
-def _row(log_ns: int, sensed: dict[str, Any], tick: dict[str, Any]) -> dict[str, Any]:
-    state, soil, vehicle = tick["state"], tick.get("soil", {}), sensed.get("vehicle", {})
-    decision = state.get("decision", {})
-    rotation = sensed["axes"].get("rotation", {}).get("telemetry", {})
+def _sensed(data: bytes) -> dict[str, Any]:
+    """What a tick knew."""
+    told = said(data)
+    vehicle, axes = told.get("vehicle", {}), told["axes"]
+    rotation = axes.get("rotation", {}).get("telemetry", {})
     found: dict[str, Any] = {
-        "wall_time": datetime.fromtimestamp(log_ns / 1e9, UTC).isoformat(timespec="milliseconds"),
-        "now_s": tick["now_s"],
-        "mode": state["mode"],
-        "reason": state["reason"],
-        "zone": soil.get("zone"),
-        "confidence": soil.get("confidence"),
-        "left_l": soil.get("volume_left_l"),
-        "center_l": soil.get("volume_center_l"),
-        "right_l": soil.get("volume_right_l"),
-        "ahead_zone": soil.get("ahead", {}).get("zone"),
-        "ahead_confidence": soil.get("ahead", {}).get("confidence"),
-        **{f"ahead_{third}_l": soil.get("ahead", {}).get("litres", {}).get(third) for third in THIRDS},
-        "decision": decision.get("zone"),
-        "decision_deg": decision.get("angle_deg"),
+        "now_s": _seconds(told["now_s"]),
         "speed_m_per_s": _value(vehicle, "speed_m_per_s"),
         "travelled_m": _value(vehicle, "travelled_m"),
         "torque_nm": _value(rotation, "torque_nm"),
         "temperature_c": _value(rotation, "temperature_c"),
-        "faults": "; ".join(fault["name"] for fault in tick["faults"]),
-        "commands": "; ".join(f"{c['command']} by {c.get('client') or '?'}" for c in sensed["commands"]),
+        "commands": "; ".join(f"{c['command']} by {c.get('client') or '?'}" for c in told["commands"]),
     }
-    for axis, decided in tick["axes"].items():
-        unit, told = UNITS[axis], sensed["axes"].get(axis, {}).get("telemetry", {})
-        found[f"{axis}_requested_{unit}"] = decided.get("requested")
-        found[f"{axis}_limited_{unit}"] = decided.get("limited")
-        found[f"{axis}_sent_{unit}"] = decided.get("send")
-        found[f"{axis}_measured_{unit}"] = _value(told, "angle_deg" if axis == "rotation" else "position_mm")
-        found[f"{axis}_current_a"] = _value(told, "current_a")
-        found[f"{axis}_because"] = decided.get("because")
-    return {name: value for name, value in found.items() if value is not None}
+    for axis, each in axes.items():
+        telemetry = each.get("telemetry", {})
+        found[f"{axis}_measured_{UNITS[axis]}"] = _value(
+            telemetry, "angle_deg" if axis == "rotation" else "position_mm"
+        )
+        found[f"{axis}_current_a"] = _value(telemetry, "current_a")
+    return found
 
 
-def _value(told: Mapping[str, Any], name: str) -> Any:
+def _tick(data: bytes) -> dict[str, Any]:
+    """What it decided."""
+    told = said(data)
+    state, soil = told["state"], told.get("soil", {})
+    ahead, decision = soil.get("ahead", {}), state.get("decision", {})
+    found: dict[str, Any] = {
+        "now_s": _seconds(told["now_s"]),
+        "mode": _text(state["mode"]),
+        "reason": _text(state["reason"]),
+        "zone": _text(soil.get("zone")),
+        "confidence": _number(soil.get("confidence")),
+        "left_l": _number(soil.get("volume_left_l")),
+        "center_l": _number(soil.get("volume_center_l")),
+        "right_l": _number(soil.get("volume_right_l")),
+        "ahead_zone": _text(ahead.get("zone")),
+        "ahead_confidence": _number(ahead.get("confidence")),
+        **{f"ahead_{third}_l": _number(ahead.get("litres", {}).get(third)) for third in THIRDS},
+        "decision": _text(decision.get("zone")),
+        "decision_deg": _number(decision.get("angle_deg")),
+        "faults": "; ".join(fault["name"] for fault in told["faults"]),
+    }
+    for axis, decided in told["axes"].items():
+        unit = UNITS[axis]
+        found[f"{axis}_requested_{unit}"] = _number(decided.get("requested"))
+        found[f"{axis}_limited_{unit}"] = _number(decided.get("limited"))
+        found[f"{axis}_sent_{unit}"] = _number(decided.get("send"))
+        found[f"{axis}_because"] = _text(decided.get("because"))
+    return found
+
+
+def _value(told: Mapping[str, Any], name: str) -> float | None:
     reading = told.get(name)
-    return reading["value"] if reading is not None and reading.get("valid", True) else None
+    return _number(reading["value"]) if reading is not None and reading.get("valid", True) else None
+
+
+def _number(value: Any) -> float | None:
+    """A measurement; None: not known, as what no measurement can be is written (as a word: NaN, Infinity)."""
+    if value is None or (isinstance(value, str) and not math.isfinite(float(value))):
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{str(value)[:40]!r} is no number")
+    if not abs(value) < MOST:
+        raise ValueError("a number in it is no measurement")
+    return value
+
+
+def _seconds(value: Any) -> float:
+    found = _number(value)
+    if found is None:
+        raise ValueError("now_s: no time")
+    return found
+
+
+def _text(value: Any) -> str | None:
+    if value is not None and not isinstance(value, str):
+        raise TypeError(f"{str(value)[:40]!r} is no text")
+    return value
 
 
 def write_csv(path: Path, found: Iterable[Row]) -> int:

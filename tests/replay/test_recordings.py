@@ -51,7 +51,7 @@ def update(path: Path) -> None:
         classifier = make_classifier(config.perception, config.camera.calibration, config.blade, camera=config.camera)
         file = RecordingFile(new, Recording(frames).head, recording.config_json)
         log_ns = next(Recording(frames).messages()).log_ns
-        for judged in raw_frames(Recording(frames)):
+        for _, judged in raw_frames(Recording(frames)):
             seen = judge_frame(
                 classifier, judged.frame, judged.angle_deg, judged.angle_age_s, judged.judged_s,
                 config.perception.decision, judged.attitude,

@@ -115,9 +115,22 @@ def test_a_first_chunk_costs_no_more_where_the_summary_names_the_channels(whole:
     assert len(list(recording.messages((TICK,)))) > len(WORK) - 30
 
 
-def test_without_a_summary_what_nobody_names_is_a_gap_and_not_silence(whole: Recording, tmp_path: Path) -> None:
-    first, last = chunks_of(whole)[0]
+def test_a_first_chunk_costs_no_more_in_a_file_without_an_end_either(whole: Recording, tmp_path: Path) -> None:
+    chunks = chunks_of(whole)
+    (first, last), (after, _) = chunks[:2]
     recording = damaged(whole, tmp_path, (first + 60, last), keeps_end=False)
+    (gap,) = recording.gaps
+    assert (gap.chunk_n, gap.first_byte_n, gap.bytes_n) == (1, first, after - first)
+    found = [message for message in recording.messages() if message.topic != GAP]
+    assert found == list(whole.messages())[-len(found) :]
+    assert len(list(recording.messages((TICK,)))) > len(WORK) - 30
+
+
+def test_without_a_summary_what_nobody_names_is_a_gap_and_not_silence(whole: Recording, tmp_path: Path) -> None:
+    """As of a version that did not name channels in the head."""
+    first, last = chunks_of(whole)[0]
+    at = whole.path.read_bytes().index(b"graderd.channels")
+    recording = damaged(whole, tmp_path, (at, at + 7), (first + 60, last), keeps_end=False)
     (gap,) = recording.gaps
     assert gap.bytes_n == recording.path.stat().st_size - first
     assert list(recording.messages((TICK,))) == []
@@ -262,7 +275,7 @@ def test_raw_frames_are_never_put_together_across_a_gap(
     assert len(list(raw_frames(frames))) == 3
     _, (first, last), _ = chunks_of(frames)
     lost = damaged(frames, tmp_path, (first + 60, last))
-    assert [one.frame.color_number for one in raw_frames(lost)] == [0, 2]
+    assert [one.frame.color_number for _, one in raw_frames(lost)] == [0, 2]
     assert check(Recording(run)).picture_gaps == lost.gaps
     assert run_app(["record", "export", str(run), "--to", str(tmp_path / "out")]) == 0
     assert f"{path.name}: damaged in chunk 2" in capsys.readouterr().err

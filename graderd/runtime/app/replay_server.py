@@ -7,12 +7,11 @@ pauses and jumps by services; every command is refused, and says why.
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
 import signal
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -33,12 +32,11 @@ from graderd.core.tick import Sensed, Tick
 from graderd.hal.device import DeviceService, NoArguments
 from graderd.hal.errors import DeviceError, ProtocolError
 from graderd.hal.settings import Finite, Settings
-from graderd.record.layout import GAP, PREVIEW, SENSED, TICK, WIRE, Gap, sensed_of, tick_of
-from graderd.record.reader import Recording, said
+from graderd.record.layout import GAP, PREVIEW, SENSED, TICK, WIRE, WIRES, Gap, Message, Wire, clock, sensed_of, tick_of
+from graderd.record.reader import Recording, picture_data
 from graderd.runtime.status import build_status
 
 NO_MACHINE = "this is a recording: there is no machine behind it"
-WIRES = ("can", "servo")
 
 
 class PlayArguments(Settings):
@@ -99,7 +97,7 @@ class Player:
         self.duration_s = extent.duration_s
         self._speed = speed
         self._paused = False
-        self._gap: Gap | None = None
+        self._missing = ""
         self._jump_s: float | None = from_s
         self._begun_n = 0
         self._figures = tick_settings(self._config).figures
@@ -113,21 +111,30 @@ class Player:
         self._show_first()
 
     def _show_first(self) -> None:
-        knew = b""
+        knew: Message | None = None
         for message in self._recording.messages((SENSED, TICK)):
             if message.topic == SENSED:
-                knew = message.data
-            elif knew:
-                self._show(knew, message.data, message.log_ns)
+                knew = message
+            elif knew is not None and self._show(knew, message):
                 return
-        raise ProtocolError(str(self._recording.path), "no tick is in it")
+        why = next((f": {each}" for each in self._recording.unreadable), "")
+        raise ProtocolError(str(self._recording.path), f"no tick is in it that can be shown{why}")
 
-    def _show(self, knew: bytes, told: bytes, log_ns: int) -> None:
-        try:
-            tick, sensed = tick_of(told), sensed_of(knew)
-        except ValueError as error:
-            cause = f"its ticks are of another version ({str(error).splitlines()[0]})"
-            raise ProtocolError(str(self._recording.path), cause, "Play it with the version in its head") from None
+    def _show(self, knew: Message, told: Message) -> bool:
+        """The machine as it was at a tick. What is not as graderd writes it is not shown."""
+        sensed = self._recording.value_of(knew, sensed_of)
+        tick = self._recording.value_of(told, tick_of)
+        if sensed is None or tick is None:
+            return False
+        former = self._loop, self._at_ns
+        self._take(sensed, tick, told.log_ns)
+        # Values that no machine has are found where the status is made of them.
+        if self._recording.value_of(told, lambda _: self.status()) is None:
+            self._loop, self._at_ns = former
+            return False
+        return True
+
+    def _take(self, sensed: Sensed, tick: Tick, log_ns: int) -> None:
         if sensed.observation is not None:
             self._eyes.captures_s.append(sensed.observation.capture_s)
         late_s = self._loop.lateness_s if self._loop else deque[float](maxlen=500)
@@ -147,19 +154,23 @@ class Player:
     async def _play(self, from_ns: int) -> None:
         """To the end, or to a jump."""
         topics = (SENSED, TICK, GAP, PREVIEW, *(WIRE + name for name in WIRES))
-        knew, clock_s, clock_ns, first = b"", time.monotonic(), from_ns, True
+        clock_s, clock_ns, first = time.monotonic(), from_ns, True
+        knew: Message | None = None
         self._eyes.captures_s.clear()
-        self._gap = None
+        self._missing = ""
         for message in self._recording.messages(topics, from_ns):
             if message.topic == SENSED:
-                knew = message.data
+                knew = message
             elif message.topic == GAP:
-                self._gap, knew = Gap.model_validate_json(message.data), b""
+                gap = self._recording.value_of(message, Gap.model_validate_json)
+                self._missing, knew = str(gap or _not_as_written(message)), None
             elif message.topic == PREVIEW:
-                self._picture = base64.b64decode(said(message)["data"]), message.log_ns / 1e9
+                if (picture := self._recording.value_of(message, picture_data)) is not None:
+                    self._picture = picture, message.log_ns / 1e9
             elif message.topic.startswith(WIRE):
-                self._tell_lines(message.topic.removeprefix(WIRE), said(message)["lines"])
-            elif knew:
+                if (wire := self._recording.value_of(message, Wire.model_validate_json)) is not None:
+                    self._tell_lines(message.topic.removeprefix(WIRE), wire.lines)
+            elif knew is not None:
                 while not first:
                     if self._jump_s is not None:
                         return
@@ -173,15 +184,14 @@ class Player:
                             await self._changed.wait()
                             # Paused, sped up or sent elsewhere: what was due is due anew from here.
                             clock_s, clock_ns = time.monotonic(), self._at_ns
-                self._gap = None
-                self._show(knew, message.data, message.log_ns)
+                self._missing = "" if self._show(knew, message) else _not_as_written(message)
                 self._begun_n += first
                 first = False
                 async with self._shown:
                     self._shown.notify_all()
                 await asyncio.sleep(0)
 
-    def _tell_lines(self, name: str, lines: list[str]) -> None:
+    def _tell_lines(self, name: str, lines: Iterable[str]) -> None:
         for queue in self._lines.get(name, ()):
             with contextlib.suppress(asyncio.QueueFull):
                 queue.put_nowait("".join(f"{line}\n" for line in lines))
@@ -195,7 +205,7 @@ class Player:
         wall = datetime.fromtimestamp(self._at_ns / 1e9, UTC).isoformat(timespec="milliseconds")
         told = build_status(self._config, loop, eyes)
         told = told.model_copy(update={"wall_time": wall, "version": self._recording.head.get("version", "")})
-        return told if self._gap is None else told.model_copy(update={"faults": (_missing(self._gap), *told.faults)})
+        return told.model_copy(update={"faults": (_damaged(self._missing), *told.faults)}) if self._missing else told
 
     async def next_status(self, after_s: float) -> Status:  # noqa: ARG002  (the port's)
         """The next tick that is shown; ``after_s`` does not count: a recording also goes back."""
@@ -274,7 +284,7 @@ class Player:
     def _where(self) -> dict[str, Any]:
         at_s = (self._at_ns - self._first_ns) / 1e9
         stands = {"at_s": at_s, "duration_s": self.duration_s, "speed": self._speed, "paused": self._paused}
-        return {**stands, "in_gap": self._gap is not None, "gaps": self._gaps}
+        return {**stands, "in_gap": bool(self._missing), "gaps": self._gaps}
 
     async def service(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """Run one of them."""
@@ -289,12 +299,16 @@ class Player:
         return await service.run(wanted)
 
 
-def _missing(gap: Gap) -> FaultStatus:
+def _not_as_written(message: Message) -> str:
+    return f"{message.topic} at {clock(message.log_ns)} is not as graderd writes it"
+
+
+def _damaged(what: str) -> FaultStatus:
     """What clients are shown while what they see is older than where the playing is."""
     return FaultStatus(
         name="recording.damaged",
         reads="The recording cannot be read here: what is shown is from before",
-        detail=str(gap),
+        detail=what,
         remedy="It goes on after the gap",
         reaction="warn",
         clears="when gone",
