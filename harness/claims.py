@@ -418,6 +418,14 @@ CLAIMS: Final = (
         "a lift hears up to 100 ms later that it is to go slower",
     ),
     Mutant(
+        "F15-bus-off",
+        "drivers/j1939/link.py",
+        "            for user in tuple(self._users.values()):\n                user.hold()\n        elif event",
+        "            pass\n        elif event",
+        (J1939_STOP + "test_a_bus_off_that_is_over_before_anybody_looks_ends_motion_and_is_told",),
+        "after a short bus-off the first word lets an actuator move on",
+    ),
+    Mutant(
         "F15-last-address",
         "drivers/j1939/link.py",
         "        return user.stop_frame(self._last_address, now_s)\n",

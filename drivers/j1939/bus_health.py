@@ -8,7 +8,7 @@ from typing import Final
 
 from graderd.drivers.j1939.claim import AddressClaimer, ClaimState
 from graderd.hal.errors import DeviceError
-from graderd.hal.fault import DeviceFault, PresentFaults
+from graderd.hal.fault import EVENT_SHOWN_S, DeviceFault, PresentFaults
 
 
 class BusEvent(StrEnum):
@@ -81,6 +81,12 @@ class BusHealth:
         self._window_start_s = 0.0
         self._window_n = 0
         self._refused_s: collections.deque[float] = collections.deque(maxlen=REFUSED_N)
+        self._off_since_s: float | None = None
+
+    @property
+    def is_off(self) -> bool:
+        """Whether the controller has left the bus, and is not back."""
+        return self._off_since_s is not None
 
     def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """Conditions present now."""
@@ -90,10 +96,12 @@ class BusHealth:
 
     def on_open(self) -> None:
         """The bus is open (again): a new start."""
+        self._off_since_s = None
         self._faults.clear(*_LOST, "bus_off", "error_passive", "queue_overrun")
 
     def on_lost(self, condition: str, detail: str, now_s: float) -> None:
         """The bus is gone."""
+        self._off_since_s = None
         self._faults.clear("bus_off", "error_passive", "queue_overrun", "flood")
         self._faults.set(condition, detail, now_s)
 
@@ -107,13 +115,15 @@ class BusHealth:
         """An error frame or an adapter's state line."""
         match event:
             case BusEvent.BUS_OFF:
+                self._off_since_s = now_s
                 self._faults.clear("error_passive", "queue_overrun")
                 self._faults.set("bus_off", "the controller left the bus after too many transmit errors", now_s)
             case BusEvent.ERROR_PASSIVE:
-                self._faults.clear("bus_off")
+                self._back_on_the_bus(now_s)
                 self._faults.set("error_passive", "the controller counts 128 errors or more", now_s)
             case BusEvent.ERROR_ACTIVE:
-                self._faults.clear("bus_off", "error_passive")
+                self._back_on_the_bus(now_s)
+                self._faults.clear("error_passive")
             case BusEvent.QUEUE_OVERRUN:
                 self._faults.tell("queue_overrun", "received frames were lost", now_s, _OVERRUN_SHOWN_S)
             case BusEvent.REFUSED:
@@ -122,9 +132,19 @@ class BusHealth:
                     detail = f"it answered NACK {REFUSED_N} times within a second"
                     self._faults.tell("adapter_refuses", detail, now_s, _REFUSED_WINDOW_S)
 
+    def _back_on_the_bus(self, now_s: float) -> None:
+        """It left and came back, maybe before anybody looked: told all the same, for as long as any event is."""
+        off_since_s, self._off_since_s = self._off_since_s, None
+        if off_since_s is None:
+            return
+        self._faults.clear("bus_off")
+        left_s = off_since_s + EVENT_SHOWN_S - now_s
+        if left_s > 0.0:
+            self._faults.tell("bus_off", "the controller left the bus, and is back on it", now_s, left_s)
+
     def on_transmit_full(self, detail: str, now_s: float) -> None:
         """The transmit queue was full; after a bus-off that is only its consequence."""
-        if "bus_off" not in self._faults.names(now_s):
+        if not self.is_off:
             self._faults.tell("queue_overrun", f"transmit queue full: {detail}", now_s, _OVERRUN_SHOWN_S)
 
     def on_traffic(self, frames_n: int, now_s: float) -> None:

@@ -1,7 +1,9 @@
-"""Active diagnostic trouble codes (DM1) of SAE J1939-73, and which code stands for which fault of graderd."""
+"""Active diagnostic trouble codes (DM1) of SAE J1939-73: their bytes, when they are sent, and which code stands for
+which fault of graderd."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -78,6 +80,56 @@ def decode(data: bytes) -> tuple[frozenset[Lamp], list[Dtc]]:
     lamps = frozenset(lamp for lamp in Lamp if data[0] >> lamp & 3 == 1)
     chunks = (data[i : i + 4] for i in range(2, len(data) - 3, 4))
     return lamps, [Dtc.from_bytes(chunk) for chunk in chunks if chunk not in (bytes(4), b"\xff\xff\xff\xff")]
+
+
+PERIOD_S: Final = 1.0
+"""A DM1 is sent so often; a change of a code at once, and no sooner than so long after the former of that code."""
+_RED: Final = "red stop lamp"
+
+
+class Dm1Sender:
+    """What is said, and when: every second, and on a change at once, at most once a second for each code (and for the
+    red lamp). What comes and goes between two messages is in the next one, once, whatever has become of it."""
+
+    def __init__(self) -> None:
+        self._active: frozenset[Dtc | str] = frozenset()
+        self._owed: frozenset[Dtc | str] = frozenset()
+        self._said: frozenset[Dtc | str] = frozenset()
+        self._changed_s: dict[Dtc | str, float] = {}
+        self._due_s: float | None = None
+
+    def publish(self, dtcs: Iterable[Dtc], *, red: bool, now_s: float) -> None:
+        """Set what is active now. Nothing is sent before the first call."""
+        self._active = frozenset((*dtcs, _RED) if red else dtcs)
+        self._owed |= self._active - self._said
+        if self._due_s is None:
+            self._due_s = now_s
+
+    def present(self) -> bytes:
+        """The data of what is active now, for who asks."""
+        return _data(self._active)
+
+    def due(self, now_s: float) -> bytes | None:
+        """The data to send now; None: nothing. It stays due until :meth:`sent`."""
+        if self._due_s is None:
+            return None
+        say = self._active | self._owed
+        changed = any(now_s - self._changed_s.get(item, float("-inf")) >= PERIOD_S for item in say ^ self._said)
+        return _data(say) if changed or now_s >= self._due_s else None
+
+    def sent(self, now_s: float) -> None:
+        """What was due is on its way."""
+        say = self._active | self._owed
+        lately = {item: at_s for item, at_s in self._changed_s.items() if now_s - at_s < PERIOD_S}
+        self._changed_s = lately | dict.fromkeys(say ^ self._said, now_s)
+        self._said, self._owed = say, frozenset()
+        due_s = now_s if self._due_s is None else min(self._due_s, now_s)
+        self._due_s = max(due_s, now_s - PERIOD_S / 2) + PERIOD_S
+
+
+def _data(said: frozenset[Dtc | str]) -> bytes:
+    dtcs = sorted((item for item in said if isinstance(item, Dtc)), key=lambda dtc: (dtc.spn, dtc.fmi))
+    return encode(dtcs, amber=bool(dtcs), red=_RED in said)
 
 
 _DEVICES: Final = ("daemon", "camera", "rotation", "lift_left", "lift_right", "tilt", "can", "servo_bus")

@@ -321,8 +321,8 @@ class CanLink:
 
     def publish_faults(self, faults: Iterable[DeviceFault], *, stopped: bool = False) -> None:
         """Send the daemon's faults as DM1: amber lamp with any fault, red stop lamp while ``stopped``."""
-        dtcs = sorted({dm1.dtc_of(fault.device, fault.condition) for fault in faults}, key=lambda d: (d.spn, d.fmi))
-        self._node.publish(dtcs, amber=bool(dtcs), red=stopped, now_s=self._clock.now_s())
+        dtcs = {dm1.dtc_of(fault.device, fault.condition) for fault in faults}
+        self._node.publish(dtcs, red=stopped, now_s=self._clock.now_s())
 
     def _control(self, user: LinkUser) -> Frame | None:
         """A device's control message as it is now; None where nothing can be sent, or nothing may."""
@@ -390,12 +390,7 @@ class CanLink:
         now_s = self._clock.now_s()
         for item in items:
             if isinstance(item, BusEvent):
-                self._health.on_event(item, now_s)
-                for listener in self._taps.events:
-                    listener(item, now_s)
-                self.counters.refused_n += item is BusEvent.REFUSED
-                if item is BusEvent.ERROR_ACTIVE:
-                    self._send_all_controls()  # what was said while nobody heard us
+                self._on_event(item, now_s)
             else:
                 self._on_frame(item, now_s)
         self.counters.rx_n += len(items)
@@ -404,6 +399,19 @@ class CanLink:
             asyncio.get_running_loop().call_soon(self._on_readable)
         if self._node.outbox:
             self._flush()
+
+    def _on_event(self, event: BusEvent, now_s: float) -> None:
+        was_off = self._health.is_off
+        self._health.on_event(event, now_s)
+        for listener in self._taps.events:
+            listener(event, now_s)
+        self.counters.refused_n += event is BusEvent.REFUSED
+        if event is BusEvent.BUS_OFF:
+            # Not when a tick has seen it: the controller may be back by then, and its first word has to end motion.
+            for user in tuple(self._users.values()):
+                user.hold()
+        elif event is BusEvent.ERROR_ACTIVE or (was_off and not self._health.is_off):
+            self._send_all_controls()  # what was said while nobody heard us
 
     def _on_frame(self, frame: Frame, now_s: float) -> None:
         if self._own.is_echo(frame, now_s):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -13,7 +14,6 @@ from graderd.drivers.j1939.name import Name
 from graderd.drivers.j1939.transport import Message, Transport
 from graderd.hal.clock import Pace
 
-DM1_PERIOD_S: Final = 1.0
 _ANSWER_RATE_HZ: Final = 20.0
 _ANSWER_BURST_N: Final = 10
 
@@ -70,10 +70,7 @@ class J1939Node:
         """When anybody last asked for claims; a claim soon after is an answer and no restart."""
         self.nacks_sent_n = 0
         self._answers = Pace(_ANSWER_RATE_HZ, _ANSWER_BURST_N)
-        self._dm1_data = dm1.encode([])
-        self._dm1_enabled = False
-        self._dm1_due_s = 0.0
-        self._dm1_changed_at_s = -1e9
+        self._dm1 = dm1.Dm1Sender()
 
     @property
     def address(self) -> int | None:
@@ -87,16 +84,9 @@ class J1939Node:
         self.outbox += self.claimer.start(now_s)
         self._follow_address()
 
-    def publish(self, dtcs: list[dm1.Dtc], *, amber: bool, red: bool, now_s: float) -> None:
-        """Set the active trouble codes: sent every second, and on a change at once (at most once a second)."""
-        data = dm1.encode(dtcs, amber=amber, red=red)
-        if not self._dm1_enabled:
-            self._dm1_enabled, self._dm1_due_s = True, now_s
-        if data != self._dm1_data:
-            self._dm1_data = data
-            if now_s - self._dm1_changed_at_s >= DM1_PERIOD_S:
-                self._dm1_changed_at_s = now_s
-                self._dm1_due_s = now_s
+    def publish(self, dtcs: Iterable[dm1.Dtc], *, red: bool, now_s: float) -> None:
+        """Set the active trouble codes and the stop lamp; see :class:`graderd.drivers.j1939.dm1.Dm1Sender`."""
+        self._dm1.publish(dtcs, red=red, now_s=now_s)
 
     def poll(self, now_s: float) -> None:
         """Let time pass; call at least every 50 ms."""
@@ -105,9 +95,9 @@ class J1939Node:
         if self.address is None:
             return
         self.outbox += self.transport.poll(now_s)
-        if self._dm1_enabled and now_s >= self._dm1_due_s:
-            self._dm1_due_s = max(self._dm1_due_s, now_s - DM1_PERIOD_S / 2) + DM1_PERIOD_S
-            self._broadcast(Pgn.DM1, self._dm1_data, now_s)
+        data = self._dm1.due(now_s)
+        if data is not None and self._broadcast(Pgn.DM1, data, now_s):
+            self._dm1.sent(now_s)
 
     def on_frame(self, frame: Frame, now_s: float) -> Message | None:
         """Take one 29-bit frame from the bus; a message for the application, if it makes one."""
@@ -173,18 +163,22 @@ class J1939Node:
     def _content_of(self, pgn: int) -> bytes | None:
         match pgn:
             case Pgn.DM1:
-                return self._dm1_data
+                return self._dm1.present()
             case Pgn.COMPONENT_ID:
                 return self.identity.component_id()
             case Pgn.SOFTWARE_ID:
                 return self.identity.software_id()
         return None
 
-    def _broadcast(self, pgn: int, data: bytes, now_s: float) -> None:
-        if len(data) <= 8:
-            self.outbox.append(Frame(make_id(6, pgn, self.address or 0), data))
-        else:
-            self.outbox += self.transport.send(pgn, data, GLOBAL, now_s)
+    def _broadcast(self, pgn: int, data: bytes, now_s: float) -> bool:
+        """False where another long message to everybody is under way."""
+        frames = (
+            [Frame(make_id(6, pgn, self.address or 0), data)]
+            if len(data) <= 8
+            else self.transport.send(pgn, data, GLOBAL, now_s)
+        )
+        self.outbox += frames
+        return bool(frames)
 
     def _acknowledge(self, control: Ack, pgn: int, requester: int) -> None:
         body = bytes((control, 0xFF, 0xFF, 0xFF, requester)) + pgn.to_bytes(3, "little")

@@ -6,7 +6,7 @@ import asyncio
 import inspect
 from collections.abc import Callable, Coroutine
 from functools import update_wrapper
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -230,3 +230,35 @@ async def test_a_stop_during_bus_off_goes_out_as_soon_as_the_controller_is_back(
     assert not enabled(first)
     assert await standstill(machine, back_s) <= 0.25
     assert BusEvent.BUS_OFF not in read()
+
+
+@pytest.mark.parametrize("back", ["error_active", "error_passive"])
+@in_mid_lift
+async def test_a_bus_off_that_is_over_before_anybody_looks_ends_motion_and_is_told(
+    loop: SimulatedLoop, machine: Machine, back: Literal["error_active", "error_passive"]
+) -> None:
+    """Both came in one read: the first word afterwards let the actuator move on, and no tick ever saw the fault."""
+    off_s = loop.now_s()
+    machine.bus.inject("bus_off")
+    machine.bus.report_state(back)
+    await asyncio.sleep(0.002)
+    (first_s, first), *_ = commands(machine, off_s)
+    assert first_s - off_s <= 0.001
+    assert not enabled(first)
+    assert "bus_off" in conditions(machine.link)
+    assert await standstill(machine, off_s) <= 0.25
+    await asyncio.sleep(off_s + 0.9 - loop.now_s())
+    assert "bus_off" in conditions(machine.link)
+    await asyncio.sleep(0.2)
+    assert "bus_off" not in conditions(machine.link)
+    assert not any(enabled(f) for _, f in commands(machine, off_s))
+
+
+@in_mid_lift
+async def test_a_bus_off_that_was_there_to_be_seen_is_over_when_it_is(loop: SimulatedLoop, machine: Machine) -> None:
+    machine.bus.inject("bus_off")
+    await asyncio.sleep(1.1)
+    assert "bus_off" in conditions(machine.link)
+    machine.bus.report_state("error_active")
+    await asyncio.sleep(0.002)
+    assert "bus_off" not in conditions(machine.link)

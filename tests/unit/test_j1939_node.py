@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
+import pytest
+
 from graderd.drivers.j1939 import dm1
 from graderd.drivers.j1939.ids import GLOBAL, NULL, Frame, Pgn, make_id, pgn_of
 from graderd.drivers.j1939.name import Name
@@ -72,12 +76,12 @@ def test_software_and_component_identification() -> None:
 
 def test_dm1_every_second_at_once_on_a_change_and_with_eight_bytes() -> None:
     node = claimed_node()
-    node.publish([], amber=False, red=False, now_s=1.0)
+    node.publish([], red=False, now_s=1.0)
     quiet = [f for f in run(node, 1.0, 5.99) if pgn_of(f.can_id) == Pgn.DM1]
     assert len(quiet) == 5
     assert quiet[0] == Frame(0x18FECAE7, bytes((0, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF)))
     fault = dm1.dtc_of("lift_left", "overload")
-    node.publish([fault], amber=True, red=True, now_s=6.1)
+    node.publish([fault], red=True, now_s=6.1)
     (changed,) = run(node, 6.1, 6.12)
     assert len(changed.data) == 8
     lamps, codes = dm1.decode(changed.data)
@@ -90,20 +94,68 @@ def test_dm1_changes_are_sent_at_once_only_once_a_second() -> None:
     sent_n = 0
     for step in range(100):  # two seconds, another set of codes every 20 ms
         codes = [dm1.Dtc(520_200, 2)] if step % 2 else []
-        node.publish(codes, amber=bool(codes), red=False, now_s=1.0 + 0.02 * step)
+        node.publish(codes, red=False, now_s=1.0 + 0.02 * step)
         node.poll(1.0 + 0.02 * step)
         sent_n += len(node.take())
     assert sent_n <= 5
 
 
+def said_of(node: J1939Node, changes: dict[float, list[dm1.Dtc]], until_s: float) -> list[tuple[float, set[dm1.Dtc]]]:
+    """What the DM1 of a single frame say, and when, while the active codes change so, polled as the link does."""
+    said, active = [], list[dm1.Dtc]()
+    for step in range(round((until_s - 1.0) / 0.02) + 1):
+        now_s = round(1.0 + 0.02 * step, 3)
+        active = changes.get(now_s, active)
+        node.publish(active, red=False, now_s=now_s)
+        node.poll(now_s)
+        said += [(now_s, set(dm1.decode(f.data)[1])) for f in node.take() if pgn_of(f.can_id) == Pgn.DM1]
+    return said
+
+
+@pytest.mark.parametrize("since_change_s", [0.02, 0.3, 0.7, 0.98])
+def test_a_code_that_comes_and_goes_between_two_dm1_is_told_once(since_change_s: float) -> None:
+    """Where another code had changed in the second before, one that was over within it was never told."""
+    one, other = dm1.Dtc(520_200, 2), dm1.Dtc(520_201, 2)
+    came_s = round(2.2 + since_change_s, 3)
+    changes: dict[float, list[dm1.Dtc]] = {2.2: [one], 2.24: [], came_s: [other], round(came_s + 0.02, 3): []}
+    said = said_of(claimed_node(), changes, 6.0)
+    assert [at_s for at_s, codes in said if other in codes] == [came_s], "at once: it had not changed for a second"
+    assert sum(one in codes for _, codes in said) in (1, 2)
+    assert said[-1][1] == set()
+
+
+def test_a_code_that_flaps_is_told_at_most_once_a_second_and_no_change_of_it_for_good_is_missed() -> None:
+    code = dm1.Dtc(520_200, 2)
+    changes = {round(2.0 + 0.04 * n, 3): [code] if n % 2 else [] for n in range(50)}
+    said = said_of(claimed_node(), changes, 8.0)
+    told_s = [at_s for at_s, _ in said if at_s > 2.02]
+    assert all(later - at >= 0.99 for at, later in pairwise(told_s))
+    assert [bool(codes) for at_s, codes in said if at_s > 5.0] == [True] * 3
+
+
+def test_what_is_owed_waits_for_a_long_message_under_way_and_for_an_address() -> None:
+    node = claimed_node()
+    code = dm1.Dtc(520_200, 2)
+    node.publish([], red=False, now_s=1.0)
+    run(node, 1.0, 1.1)
+    long = [dm1.Dtc(520_300 + n, 2) for n in range(8)]
+    node.publish(long, red=False, now_s=1.2)
+    node.poll(1.2)
+    node.publish([*long, code], red=False, now_s=1.24)
+    node.publish(long, red=False, now_s=1.26)
+    frames = run(node, 1.26, 3.0)
+    bodies = b"".join(f.data[1:] for f in frames if pgn_of(f.can_id) == Pgn.TP_DATA)
+    assert code.to_bytes() in bodies
+
+
 def test_several_codes_travel_by_bam() -> None:
     node = claimed_node()
     codes = [dm1.dtc_of("lift_left", "overload"), dm1.dtc_of("can", "bus_off"), dm1.dtc_of("tilt", "no_feedback")]
-    node.publish(codes, amber=True, red=False, now_s=1.0)
+    node.publish(codes, red=False, now_s=1.0)
     frames = run(node, 1.0, 1.5)
     assert frames[0].data[:4] == bytes((Control.BAM, 14, 0, 2))
     data = b"".join(f.data[1:] for f in frames[1:3])
-    assert dm1.decode(data[:14])[1] == codes
+    assert dm1.decode(data[:14])[1] == sorted(codes, key=lambda code: code.spn)
 
 
 def test_trouble_codes_of_graderd_are_in_the_proprietary_block_and_differ() -> None:
