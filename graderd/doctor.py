@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 PACKAGES: Final = ("graderd", "pydantic", "numpy", "opencv-python-headless", "pyserial", "python-can", "fastapi")
 CAMERA_VENDOR: Final = "8086"
 FTDI_LATENCY_MOST_MS: Final = 2
+CAN_QUEUE_LEAST_N: Final = 128
+"""What ``systemd/can-link`` sets: with the kernel's 10, three actuators' messages fill the queue of a bus that stalls
+for a third of a second, and what is said after them is refused."""
 FREE_LEAST_MB: Final = 500.0
 RUN_S: Final = 5.0
 USB3_MBIT_PER_S: Final = 5000
@@ -302,6 +305,13 @@ def _can(machine: Machine) -> Iterator[Finding]:
         yield Finding("can", Verdict.FAIL if state != "ERROR-WARNING" else Verdict.WARN, seen, repair)
     else:
         yield Finding("can", Verdict.PASS, seen)
+    queue_n = link.get("txqlen")
+    if queue_n is not None and queue_n < CAN_QUEUE_LEAST_N:
+        seen = f"{can.channel} queues {queue_n} messages, not {CAN_QUEUE_LEAST_N}: a stop may find the queue full"
+        repair = f"sudo ip link set {can.channel} txqueuelen {CAN_QUEUE_LEAST_N}"
+        yield Finding("can queue", Verdict.WARN, seen, repair)
+    elif queue_n is not None:
+        yield Finding("can queue", Verdict.PASS, f"{can.channel} queues {queue_n} messages")
 
 
 def _addresses(machine: Machine) -> Iterator[Finding]:

@@ -1,11 +1,13 @@
 """The little that survives a restart: why the machine stopped last, and whether somebody has reset that stop.
 
-Written atomically, checked when read. A thread writes: a disk that stalls must hold up neither a stop nor a tick.
+Written atomically and through to the disk, so that a power cut leaves the one before or this one; checked when read. A
+thread writes: a disk that stalls must hold up neither a stop nor a tick.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import shutil
@@ -120,8 +122,25 @@ class StateFile:
             temporary = path.with_suffix(".new")
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                temporary.write_text(json.dumps(stop.model_dump()), encoding="utf-8")
+                with temporary.open("w", encoding="utf-8") as file:
+                    file.write(json.dumps(stop.model_dump()))
+                    file.flush()
+                    _through_to_disk(file.fileno())
                 temporary.replace(path)
+                directory = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+                try:
+                    _through_to_disk(directory)
+                finally:
+                    os.close(directory)
                 self._problem = ""
             except OSError as error:
                 self._problem = f"{path}: {error.strerror}"
+
+
+def _through_to_disk(fd: int) -> None:
+    """Wait until it is on the disk; what knows no such thing (a directory of some network file systems) is done."""
+    try:
+        os.fsync(fd)
+    except OSError as error:
+        if error.errno != errno.EINVAL:
+            raise

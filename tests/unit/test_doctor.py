@@ -17,6 +17,7 @@ from graderd.doctor import Finding, Machine, Verdict, as_dict, examine, without_
 LINK = {
     "flags": ["UP"],
     "operstate": "UP",
+    "txqlen": 128,
     "linkinfo": {"info_data": {"state": "ERROR-ACTIVE", "bittiming": {"bitrate": 250_000}}},
 }
 STATUS: dict[str, Any] = {
@@ -133,6 +134,7 @@ BROKEN: tuple[tuple[str, Callable[[Bench], object], str, Verdict, str], ...] = (
     ("no link", lambda b: setattr(b, "link", None), "can", Verdict.FAIL, "systemctl start graderd-can@can0"),
     ("link down", lambda b: b.link and b.link.update(flags=[]), "can", Verdict.FAIL, "systemctl start"),
     ("bit rate", link(bittiming={"bitrate": 500_000}), "can", Verdict.FAIL, "systemctl restart graderd-can@can0"),
+    ("queue", lambda b: b.link and b.link.update(txqlen=10), "can queue", Verdict.WARN, "txqueuelen 128"),
     ("termination", link(state="ERROR-PASSIVE"), "can", Verdict.FAIL, "60 Ω"),
     ("servo", lambda b: b.differences.append({"kind": "model"}), "servo", Verdict.FAIL, "graderd profile verify"),
     ("clock", lambda b: b.answers.update(timedatectl="NTPSynchronized=no"), "clock", Verdict.WARN, "set-ntp true"),

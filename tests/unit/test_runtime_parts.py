@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import socket
 import time
@@ -102,6 +103,47 @@ def test_a_state_directory_that_stalls_is_not_waited_for_and_told(
     last = state.load()
     assert last is not None
     assert last.reason == "four"
+
+
+def test_a_stop_is_on_the_disk_before_it_takes_the_place_of_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing was written through: a power cut could leave an empty file, or the stop before the last."""
+    done: list[str] = []
+    fsync, replace_file = os.fsync, os.replace
+
+    def through(fd: int) -> None:
+        path = Path(f"/proc/self/fd/{fd}").resolve()
+        done.append(f"{path.name}: {path.read_text() and 'whole' if path.is_file() else 'directory'}")
+        fsync(fd)
+
+    def put(self: Path, target: Path) -> Path:
+        done.append("replaced")
+        replace_file(self, target)
+        return target
+
+    monkeypatch.setattr(os, "fsync", through)
+    monkeypatch.setattr(Path, "replace", put)
+    state = StateFile(str(tmp_path))
+    state.save("enough", 1)
+    assert state.settle()
+    assert done == ["last_stop.new: whole", "replaced", f"{tmp_path.name}: directory"]
+    assert state.problem == ""
+
+
+def test_a_disk_that_fails_to_take_a_stop_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    state = StateFile(str(tmp_path))
+    state.save("enough", 1)
+    assert state.settle()
+    assert "Input/output error" in state.problem
+    monkeypatch.undo()
+    state.save("again", 2)
+    assert state.settle()
+    assert state.problem == ""
 
 
 @pytest.mark.live
