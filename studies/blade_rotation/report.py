@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 Picture = npt.NDArray[np.uint8]
 PAGE, RESULTS = "index.html", "results.parquet"
 TITLE = "The study behind the rotation rule, computed again"
+WIDER = "body { max-width: 80rem; } th, td { padding: .28rem .35rem; } pre { white-space: pre-wrap; }"
 ORDERS = {True: "reproduced", False: "not reproduced", None: "the intervals do not tell"}
 HEIGHT_MAX_MM = 200.0
 SHOWN = (SPREAD, "spread_mass_95_mm", "spread_second_moment_mm", HEIGHT, LOAD, "blade_load_max_n")
@@ -55,7 +56,7 @@ def write(store: Store) -> Path:
     found.lines[:] = [line for line in found.lines if any(row.case == line.name for row in found.rows)]
     parts = [
         f"<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
-        f"<title>{TITLE}</title><style>{STYLE} body {{ max-width: 80rem; }}</style><body><h1>{TITLE}</h1>",
+        f"<title>{TITLE}</title><style>{STYLE} {WIDER}</style><body><h1>{TITLE}</h1>",
         _summary(found, results),
         _parameters(),
         _tables(found),
@@ -176,8 +177,8 @@ def _tables(found: Table) -> str:
                 "seeds",
                 "study",
                 "deviation",
-                "study's value",
-                "order",
+                "in it",
+                "study's order",
             )
             head = "".join(f"<th>{name}" for name in names)
             parts.append(f"<h2>{title}</h2><p>{note} Deviation: mean less the study's value.</p>")
@@ -204,7 +205,7 @@ def _row(row: Row, said: float | None, order: str) -> str:
     cells = [escape(row.case), f"{row.angle_deg:g}°", escape(title_of(row.measure))]
     inside = ""
     if said is not None and row.low is not None and row.high is not None:
-        inside = "inside the interval" if row.low <= said <= row.high else "outside"
+        inside = "yes" if row.low <= said <= row.high else "no"
     deviation = "" if said is None else f"{row.value - said:+.1f}"
     if said is not None and row.measure != HEIGHT:
         deviation += f" ({(row.value / said - 1.0) * 100.0:+.0f} %)"
