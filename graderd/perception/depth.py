@@ -32,7 +32,18 @@ from graderd.perception.forms import (
     standing,
     steep_cells,
 )
-from graderd.perception.geometry import F32, F64, NOMINAL_WIDTH_PX, View, cos_sin, third_outlines_px
+from graderd.perception.geometry import (
+    CENTER,
+    F32,
+    F64,
+    LEFT,
+    NOMINAL_WIDTH_PX,
+    RIGHT,
+    U8,
+    View,
+    cos_sin,
+    third_outlines_px,
+)
 from graderd.perception.ground import Ground, GroundFit
 from graderd.perception.registration import BladeFinder, BladeFix, Stance, UpperEdge
 from graderd.perception.settings import DecisionSettings, DepthSettings
@@ -106,7 +117,7 @@ class DepthJudge:
     def __init__(self, view: View, blade: BladeGeometry, settings: DepthSettings, decision: DecisionSettings) -> None:
         self._settings = settings
         self._view = view
-        self._grids: OrderedDict[int, tuple[Bools, list[int]]] = OrderedDict()
+        self._grids: OrderedDict[int, tuple[U8, list[int]]] = OrderedDict()
         self._decision = decision
         self._blade = blade
         # The stride is meant for a picture 848 pixels across; a smaller one is sampled as densely on the ground.
@@ -281,13 +292,12 @@ class DepthJudge:
         Some way behind and beside it too, where its face is looked for.
         """
         cos, sin = cos_sin(angle_deg)
-        turned = np.array(((-sin, cos, 0.0), (cos, sin, 0.0), (0.0, 0.0, 1.0)), dtype=np.float32) @ points
-        near = turned[1] > self._blade.x_offset_m - BEHIND_M
-        near &= turned[1] < self._blade.x_offset_m + STANDING_REACH_M
-        near &= np.abs(turned[0]) < self._blade.length_m / 2 + self._travel_m * BESIDE_RATIO
+        s, ahead = np.array(((-sin, cos), (cos, sin)), dtype=np.float32) @ points[:2]
+        near = ahead > self._blade.x_offset_m - BEHIND_M
+        near &= ahead < self._blade.x_offset_m + STANDING_REACH_M
+        near &= np.abs(s) < self._blade.length_m / 2 + self._travel_m * BESIDE_RATIO
         pixels = np.flatnonzero(near)
-        s, ahead, z = turned.take(pixels, axis=1)
-        return pixels, s, ahead, z
+        return pixels, s.take(pixels), ahead.take(pixels), points[2].take(pixels)
 
     def _valid_shares(self, pixels: I64, good: Bools, angle_deg: float) -> tuple[float, float, float]:
         """Of the pixels on each third, the share that is among the ``good`` of ``pixels``."""
@@ -297,15 +307,12 @@ class DepthJudge:
             if len(self._grids) > KEPT_GRIDS_N:
                 self._grids.popitem(last=False)
         thirds, totals = self._grids[step]
-        seen = np.zeros(thirds.shape[1], dtype=np.bool_)
-        seen[pixels] = good
-        left, center, right = (
-            np.count_nonzero(on_it & seen) / total_n for on_it, total_n in zip(thirds, totals, strict=True)
-        )
+        on = thirds.take(pixels)
+        left, center, right = (np.count_nonzero((on == third) & good) / total_n for third, total_n in enumerate(totals))
         return left, center, right
 
-    def _third_grid(self, angle_deg: float) -> tuple[Bools, list[int]]:
-        """For each third the sampled pixels that lie on it, and how many these are, or 1 where there are none."""
+    def _third_grid(self, angle_deg: float) -> tuple[U8, list[int]]:
+        """On which third each sampled pixel lies, 3 for none, and how many lie on each, or 1 where none do."""
         lens = self._view.lens
         rows, columns = (len(range(self._stride // 2, side, self._stride)) for side in (lens.height, lens.width))
         grid = np.full((rows, columns), 3, dtype=np.uint8)
@@ -313,8 +320,7 @@ class DepthJudge:
             if np.isfinite(outline).all():
                 places = (outline - self._stride // 2) / self._stride
                 cv2.fillPoly(grid, [np.round(places * (1 << 4)).astype(np.int32)], third, shift=4)
-        on_each = grid.ravel() == np.arange(3)[:, None]
-        return on_each, np.maximum(on_each.sum(axis=1), 1).tolist()
+        return grid.ravel(), [max(int(np.count_nonzero(grid == third)), 1) for third in (LEFT, CENTER, RIGHT)]
 
     def _noise_m(self, ground: Ground, angle_deg: float) -> F64:
         """The noise of heights in each cell: it grows with the square of the distance, as disparity has it."""
@@ -340,8 +346,9 @@ class DepthJudge:
         i += np.minimum(j, ahead_n - 1, out=j)
         shape = (along_n, ahead_n)
         count = np.bincount(i, minlength=along_n * ahead_n).reshape(shape)
-        total = np.bincount(i, weights=z, minlength=count.size).reshape(shape)
-        squares = np.bincount(i, weights=np.square(z, dtype=np.float64), minlength=count.size).reshape(shape)
+        heights = z.astype(np.float64)
+        total = np.bincount(i, weights=heights, minlength=count.size).reshape(shape)
+        squares = np.bincount(i, weights=heights * heights, minlength=count.size).reshape(shape)
         seen = count > 0
         height = np.asarray(total / np.maximum(count, 1), dtype=np.float64)
         form = settings.form
@@ -372,8 +379,8 @@ class DepthJudge:
             ahead_l,
             doubtful_l,
             doubtful_ahead_l,
-            self._litres(np.where(seen, height, filled), forms.things)[0],
-            self._litres(filled, forms.weak)[0],
+            self._litres(np.where(seen, height, filled) * forms.things)[0] if forms.things.any() else NOTHING,
+            self._litres(filled * forms.weak)[0] if forms.weak.any() else NOTHING,
             valid,
             ground,
             fix,
@@ -400,18 +407,15 @@ class DepthJudge:
 
     def _split(self, height: F64, where: Bools, angle_deg: float) -> tuple[Litres, Litres, Litres]:
         """Litres per third of the map's cells ``where``: all before the blade, carried by it, and ahead of it."""
-        soil = np.maximum(height * where, 0.0)
+        soil = height * where
+        all_l, hollow_l = self._litres(soil)
         meeting_deg = min(max(angle_deg, -STEEPEST_MEETING_DEG), STEEPEST_MEETING_DEG)
-        carried_l, ahead_l = self._soil_split(soil, meeting_deg)
-        all_l, hollow_l = self._litres(height, where)
+        carried_l, ahead_l = self._soil_split(np.maximum(soil, 0.0, out=soil), meeting_deg)
         return all_l, _plus(carried_l, hollow_l), ahead_l
 
-    def _litres(self, height: F64, where: Bools) -> tuple[Litres, Litres]:
-        """Litres per third of the map's cells ``where``; and what of it lies in the hollow of the face."""
-        where = where[self._before]
-        if not where.any():
-            return NOTHING, NOTHING
-        ahead = height[self._before] * where
+    def _litres(self, height: F64) -> tuple[Litres, Litres]:
+        """Litres per third of a map (0 where there is nothing); and what of it lies in the hollow of the face."""
+        ahead = height[self._before]
         hollow = self._finder.hollow_m2(ahead[:, 0])
         both = np.array((ahead.sum(axis=1) * self._cell_d_m + hollow, hollow))
         thirds = both.reshape(2, 3, -1).sum(axis=2) * (self._cell_s_m * 1000.0)
@@ -455,9 +459,10 @@ class SoilSplit:
         self._cells, self._blade, self._travel_m = cells, blade, travel_m
         self._drop_m = math.tan(math.radians(repose_deg)) * cells.d_m
         self._crest_n = int(np.count_nonzero(cells.d_m < CREST_M))
-        self._thirds = self._third(cells.s_m)
-        self._beside = np.abs(cells.s_m) > blade.length_m / 2
-        self._met: tuple[float, I64] = (math.nan, self._thirds)
+        self._leans = (np.abs(cells.s_m) <= blade.length_m / 2).astype(np.float64)[:, None]
+        self._place = 2.5 - cells.s_m * (3.0 / blade.length_m)
+        self._leaning = self._thirds(self._place.copy())
+        self._met: tuple[float, I64, int] = (math.nan, self._leaning, 0)
 
     def __call__(self, height_m: F64, angle_deg: float) -> tuple[Litres, Litres]:
         """Litres carried, and litres ahead, of a map of soil heights (0 where there is none).
@@ -465,8 +470,6 @@ class SoilSplit:
         Raises:
             ValueError: the blade is turned too far to meet anything.
         """
-        if self._met[0] != angle_deg:
-            self._met = angle_deg, self._meeting(angle_deg)
         # The slope goes through the crest. Where soil rises towards one, the face behind was seen lower, or not at all.
         crest = height_m[:, : self._crest_n]
         climb = np.maximum(crest - height_m[:, :1], 0.0)
@@ -475,28 +478,33 @@ class SoilSplit:
         rise[:, : self._crest_n] = top.max(axis=1, keepdims=True)
         carried = np.minimum.accumulate(rise, axis=1)
         carried -= self._drop_m
-        np.clip(carried, 0.0, height_m, out=carried)
-        carried[self._beside] = 0.0  # nothing to lean on
-        litres = 1000.0 * self._cells.area_m2
-        leaning = np.bincount(self._thirds, weights=carried.sum(axis=1), minlength=PLACES_N) * litres
-        coming = np.bincount(self._met[1], weights=(height_m - carried).ravel(), minlength=PLACES_N) * litres
-        return _inner(leaning), _inner(coming)
+        np.maximum(carried, 0.0, out=carried)
+        np.minimum(carried, height_m, out=carried)
+        carried *= self._leans  # beyond the ends there is nothing to lean on
+        if self._met[0] != angle_deg:
+            self._met = angle_deg, *self._meeting(angle_deg)
+        _, meeting, met_n = self._met
+        coming = height_m[:, :met_n] - carried[:, :met_n]
+        return self._litres(self._leaning, carried.sum(axis=1)), self._litres(meeting, coming.ravel())
 
-    def _meeting(self, angle_deg: float) -> I64:
-        """The third that will meet each cell of the map, and 0 for what is met by none within the travel."""
-        met_s, met_m = meeting_point(self._cells.s_m[:, None], self._cells.d_m, angle_deg)
-        met = self._third(met_s)
-        met[:, met_m > self._travel_m] = 0
-        return met.ravel()
+    def _meeting(self, angle_deg: float) -> tuple[I64, int]:
+        """The third that will meet each cell of the map's first columns, and how many are met within the travel.
 
-    def _third(self, s_m: F64) -> I64:
-        """1, 2, 3 for the left, center and right third in which places lie; 0 and 4 for what lies beyond the ends."""
-        place = s_m * (-3.0 / self._blade.length_m)
-        place += 2.5
-        return np.clip(place, 0.0, 4.0, out=place).astype(np.intp)
+        Soil is met the further along the blade the further ahead it lies, wherever along it that is.
+        """
+        along_m, travel_m = meeting_point(np.zeros(()), self._cells.d_m, angle_deg)
+        met_n = int(np.count_nonzero(travel_m <= self._travel_m))
+        along_m *= -3.0 / self._blade.length_m
+        return self._thirds(np.add.outer(self._place, along_m[:met_n])), met_n
 
+    @staticmethod
+    def _thirds(place: F64) -> I64:
+        """1, 2, 3 for the left, center and right third, 0 and 4 for what lies beyond the ends, of places in thirds of
+        a blade that begins at 1; these are spent."""
+        np.maximum(place, 0.0, out=place)
+        return np.minimum(place, 4.0, out=place).astype(np.intp).ravel()
 
-def _inner(amounts: npt.NDArray[np.floating]) -> Litres:
-    """Without what lies beyond either end."""
-    _, left, center, right, *_ = amounts.tolist()
-    return left, center, right
+    def _litres(self, thirds: I64, heights_m: F64) -> Litres:
+        sums = np.bincount(thirds, weights=heights_m, minlength=PLACES_N) * (1000.0 * self._cells.area_m2)
+        _, left, center, right, *_ = sums.tolist()
+        return left, center, right

@@ -62,12 +62,12 @@ TALL_M = 0.03
 """Cells lower than this say nothing about form: their steepness drowns in noise."""
 FOOT_CELLS_N = 3
 """A heap's foot runs out below the level at which lumps are told apart: so many cells more count."""
-CROSS = np.asarray(cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)), dtype=np.uint8)
-SQUARE = np.ones((3, 3), dtype=np.uint8)
 ENDS_LEAST_N = 6
 """Where fewer cells show how a lump ends, as between the blade's face and a heap, nothing is said by it."""
 BESIDE_CELLS_N = 2
 """Cells so near to a steep one are not clear of it."""
+CROSS = np.asarray(cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)), dtype=np.uint8)
+SQUARE, BESIDE, FOOT = (np.ones((2 * n + 1,) * 2, dtype=np.uint8) for n in (1, BESIDE_CELLS_N, FOOT_CELLS_N))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +100,7 @@ def sort_out(
     rim = above
     if above.any():  # what hangs over it is higher
         rim = above & (height < cv2.dilate(np.where(tall, height, 0.0), CROSS) + LEVEL_M)
-    clear = tall & ~_dilated(steep, np.ones((2 * BESIDE_CELLS_N + 1,) * 2, np.uint8))
+    clear = tall & ~_dilated(steep, BESIDE)
     high = cv2.blur(filled, (3, 3)) > stands_out_m
     lump = np.asarray(labels, dtype=np.intp)
     tall_n, core_n, steep_n, ends_n, steps_n, high_n = _counts(
@@ -112,7 +112,7 @@ def sort_out(
     is_weak = ~stands & ~is_thing
     is_thing[0] = stands[0] = is_weak[0] = False  # the ground
     things, weak = is_thing.take(lump), is_weak.take(lump)
-    foot = _dilated(stands.take(lump), np.ones((2 * FOOT_CELLS_N + 1,) * 2, np.uint8))
+    foot = _dilated(stands.take(lump), FOOT)
     soil = foot & ~things & ~weak
     return Forms(soil, soil & _dilated(steep, SQUARE), things, weak)
 
@@ -129,7 +129,7 @@ def _counts(lump: npt.NDArray[np.intp], count: int, facts: tuple[Bools, ...]) ->
     held = facts[-1].astype(np.uint8)
     for fact in facts[-2::-1]:
         held <<= 1
-        held |= fact
+        held |= fact.view(np.uint8)
     numbers_n = 1 << len(facts)
     index = lump * numbers_n
     index += held
@@ -168,6 +168,12 @@ def steep_cells(square_m2: F64, count: Counts, noise_m: F64, settings: FormSetti
 
 def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[float, float] | None:
     """Where something stands upright before the face (s, d in m); None where nothing does."""
+    # What begins low enough and is tall enough goes through one level, which most pictures leave empty.
+    through = z > LOWEST_M + (ON_SOIL_STARTS_N - 1 - 0.5) * LEVEL_M
+    through &= z < LOWEST_M + (ON_SOIL_STARTS_N + 0.5) * LEVEL_M
+    through &= d > STANDING_FROM_M
+    if np.count_nonzero(through) < LEVEL_POINTS_N * STANDING_COLUMNS_N:
+        return None
     inside = np.flatnonzero(
         (z > LOWEST_M) & (z < HIGHEST_M) & (d > STANDING_FROM_M) & (d < reach_m) & (np.abs(s) < half_m)
     )
@@ -179,7 +185,6 @@ def standing(s: F32, d: F32, z: F32, half_m: float, reach_m: float) -> tuple[flo
     index *= levels_n
     index += ((z.take(inside) - LOWEST_M) / LEVEL_M).astype(np.intp)
     counts = np.bincount(index, minlength=columns_n * rows_n * levels_n).reshape(-1, levels_n)
-    # A run that begins low enough goes through this level, and few columns reach it.
     if np.count_nonzero(counts[:, ON_SOIL_STARTS_N - 1] >= LEVEL_POINTS_N) < STANDING_COLUMNS_N:
         return None
     high = np.flatnonzero(counts[:, LEVELS_N - 1 :].max(axis=1) >= LEVEL_POINTS_N)
@@ -236,12 +241,13 @@ def _lower_cones(height: F64, rise_s_per_cell: float, rise_d_per_cell: float) ->
     Distances run along the two directions of the cells; each round looks twice as far as the one before.
     """
     lower = height.astype(np.float32)
-    risen = np.empty_like(lower)
-    for cells, up, rise_per_cell in ((lower, risen, rise_s_per_cell), (lower.T, risen.T, rise_d_per_cell)):
+    for rise_per_cell in (rise_s_per_cell, rise_d_per_cell):
+        risen = np.empty_like(lower)
         far_n = 1
-        while far_n < len(cells) and far_n * rise_per_cell < SPAN_M:
-            np.add(cells, far_n * rise_per_cell, out=up)
-            np.minimum(cells[far_n:], up[:-far_n], out=cells[far_n:])
-            np.minimum(cells[:-far_n], up[far_n:], out=cells[:-far_n])
+        while far_n < len(lower) and far_n * rise_per_cell < SPAN_M:
+            np.add(lower, far_n * rise_per_cell, out=risen)
+            np.minimum(lower[far_n:], risen[:-far_n], out=lower[far_n:])
+            np.minimum(lower[:-far_n], risen[far_n:], out=lower[:-far_n])
             far_n *= 2
+        lower = np.ascontiguousarray(lower.T)  # whole rows are quicker than strided columns
     return lower

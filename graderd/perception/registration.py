@@ -85,6 +85,9 @@ TABLE_FROM_M, TABLE_TO_M, TABLE_STEP_M = -0.2, 0.8, 0.001
 """Heights above the edge for which the face's hollow is tabled."""
 
 
+Steps = tuple[int, int | None, int | None, int | None]
+
+
 @dataclass(frozen=True, slots=True)
 class Stance:
     """How the blade stands: its measured angle, and height, cross slope and pitch where they are measured.
@@ -114,22 +117,30 @@ class Stance:
         """From the cutting edge up to the upper edge."""
         return blade.height_m * math.cos(math.radians(self.attitude.pitch_deg or 0.0))
 
-    def stepped(self) -> Stance:
-        """The stance in the middle of its step. What follows from a stance is kept under this one and made from it: it
-        must not hang on which stance of the step came first, or the same frame would be judged in two ways."""
-        attitude = self.attitude
-        return Stance(
-            _stepped(self.angle_deg, EDGE_ANGLE_STEP_DEG) or 0.0,
-            MeasuredAttitude(
-                _stepped(attitude.height_mm, EDGE_HEIGHT_STEP_MM),
-                _stepped(attitude.slope_deg, EDGE_LEAN_STEP_DEG),
-                _stepped(attitude.pitch_deg, EDGE_LEAN_STEP_DEG),
-            ),
+    def steps(self) -> Steps:
+        """Angle, height, slope and pitch in whole steps. What follows from a stance is kept under these and made from
+        them (:func:`stance_of`): it must not hang on which stance of the step came first, or the same frame would be
+        judged in two ways."""
+        at = self.attitude
+        return (
+            round(self.angle_deg / EDGE_ANGLE_STEP_DEG),
+            None if at.height_mm is None else round(at.height_mm / EDGE_HEIGHT_STEP_MM),
+            None if at.slope_deg is None else round(at.slope_deg / EDGE_LEAN_STEP_DEG),
+            None if at.pitch_deg is None else round(at.pitch_deg / EDGE_LEAN_STEP_DEG),
         )
 
 
-def _stepped(value: float | None, step: float) -> float | None:
-    return None if value is None else round(value / step) * step
+def stance_of(steps: Steps) -> Stance:
+    """The stance in the middle of such steps."""
+    angle, height, slope, pitch = steps
+    return Stance(
+        angle * EDGE_ANGLE_STEP_DEG,
+        MeasuredAttitude(
+            None if height is None else height * EDGE_HEIGHT_STEP_MM,
+            None if slope is None else slope * EDGE_LEAN_STEP_DEG,
+            None if pitch is None else pitch * EDGE_LEAN_STEP_DEG,
+        ),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +191,7 @@ class BladeFinder:
         self._view = view
         self._all_rays = view.rays()
         self._position = view.position_m.astype(np.float32)
-        self._columns: dict[Stance, _EdgeColumns | None] = {}
+        self._columns: dict[Steps, _EdgeColumns | None] = {}
         self._blade = blade
         table = np.arange(TABLE_FROM_M, TABLE_TO_M, TABLE_STEP_M)
         self._setback = face_setback_m(blade, table + blade.bottom_z_m).astype(np.float32)
@@ -235,7 +246,7 @@ class BladeFinder:
         x, y, z = at.reshape(3, -1).take(place, axis=1).astype(np.float64)
         s = y * cos - x * sin
         over_ground = z - ground.height_at(x, y)
-        rise = _median_slope(s, z) if np.ptp(s) > TOP_SHARE * blade.length_m else stance.rise
+        rise = _median_slope(s, z) if s.max() - s.min() > TOP_SHARE * blade.length_m else stance.rise
         tilted = rise - (ground.slope_y * cos - ground.slope_x * sin)
         return UpperEdge(middle(z - rise * s), rise, middle(over_ground - tilted * s))
 
@@ -265,9 +276,10 @@ class BladeFinder:
 
     def _edge_columns(self, stance: Stance) -> _EdgeColumns | None:
         """The pixels in which the upper edge is looked for; None where too few are in the picture."""
-        stance = stance.stepped()
-        if stance in self._columns:
-            return self._columns[stance]
+        steps = stance.steps()
+        if steps in self._columns:
+            return self._columns[steps]
+        stance = stance_of(steps)
         lens, half = self._view.lens, self._blade.length_m / 2 - TOP_MARGIN_M
         edge = self._on_face(stance, np.linspace(-half, half, TOP_COLUMNS_N), 0.0)
         scale = lens.width / NOMINAL_WIDTH_PX
@@ -283,7 +295,7 @@ class BladeFinder:
             columns = _EdgeColumns(v * lens.width + u, rays, np.arange(len(v)) * down.size, *self._body(stance))
         if len(self._columns) >= KEPT_COLUMNS_N:
             self._columns.clear()
-        self._columns[stance] = columns
+        self._columns[steps] = columns
         return columns
 
     def _on_face(self, stance: Stance, s: F64, below_m: float) -> F64:
@@ -308,18 +320,20 @@ class BladeFinder:
         ``above_edge`` how far above the cutting edge, of a blade ``tall_m`` from edge to edge."""
         blade = self._blade
         half = blade.length_m / 2
-        upper = above_edge > tall_m - FACE_BAND_M
-        upper &= above_edge < tall_m - FACE_BELOW_TOP_M
-        upper &= np.abs(face) < SEARCH_M
-        upper &= np.abs(s) < half + SEARCH_M
-        near = np.flatnonzero(upper)
-        if near.size < FACE_LEAST_N:
+        near = np.flatnonzero(np.abs(face) < SEARCH_M)
+        near_s, height = s.take(near), above_edge.take(near)
+        upper = height > tall_m - FACE_BAND_M
+        upper &= height < tall_m - FACE_BELOW_TOP_M
+        upper &= np.abs(near_s) < half + SEARCH_M
+        places = np.flatnonzero(upper)
+        if places.size < FACE_LEAST_N:
             return BladeFix()
-        near = near[:: max(1, near.size // FACE_POINTS_N)]
-        near_s, near_face = s.take(near), face.take(near)
+        places = places[:: max(1, places.size // FACE_POINTS_N)]
+        near, near_s, below_m = near.take(places), near_s.take(places), tall_m - height.take(places)
+        near_face = face.take(near)
         inside = np.flatnonzero(np.abs(near_s) < half)
         column = ((near_s.take(inside) + half) * (COLUMNS_N / blade.length_m)).astype(np.intp)
-        below_m = tall_m - above_edge.take(near.take(inside))
+        below_m = below_m.take(inside)
         face_at, upright = self._upright(np.minimum(column, COLUMNS_N - 1, out=column), near_face.take(inside), below_m)
         s_at = (np.flatnonzero(upright).astype(np.float64) + 0.5) * (blade.length_m / COLUMNS_N) - half
         if s_at.size < SEEN_LEAST_N:
@@ -339,15 +353,16 @@ class BladeFinder:
         place = ((face + SEARCH_M) / PLACE_M).astype(np.intp)
         np.minimum(place, places_n - 1, out=place)
         levels_n = round(FACE_BAND_M / LEVEL_M)
-        level = (below_m / LEVEL_M).astype(np.intp)
-        index = column * places_n
+        index = (below_m / LEVEL_M).astype(np.intp)
+        np.minimum(index, levels_n - 1, out=index)
+        index *= COLUMNS_N
+        index += column
+        index *= places_n
         index += place
-        index *= levels_n
-        index += np.minimum(level, levels_n - 1, out=level)
-        shown = np.zeros((COLUMNS_N, places_n, levels_n), dtype=np.float32)
+        shown = np.zeros((levels_n, COLUMNS_N, places_n), dtype=np.float32)
         shown.reshape(-1)[index] = 1
         # A face lies across the bound of two places as well as on one.
-        tall = np.maximum(shown[:, 1:], shown[:, :-1]).sum(axis=2)
+        tall = np.maximum(shown[..., 1:], shown[..., :-1]).sum(axis=0)
         best = tall.argmax(axis=1)  # the rearmost where several are as tall
         upright = tall.max(axis=1) >= UPRIGHT_LEVELS_N
         best[~upright] = -2
@@ -388,7 +403,7 @@ def _line_of_most(s: F64, face: F64) -> tuple[float, float]:
     off = face - at_0[:, None] - slope[:, None] * s
     on_line = np.abs(off) < ON_FACE_M
     votes = on_line - BEHIND_VOTES * (off <= -ON_FACE_M)
-    best = int(np.argmax(votes.sum(axis=1) - np.abs(slope) * TURN_VOTES - at_0))
+    best = int((votes.sum(axis=1) - np.abs(slope) * TURN_VOTES - at_0).argmax())
     s, face = s[on_line[best]], face[on_line[best]]
     s_mean, face_mean = s.sum() / s.size, face.sum() / s.size
     s -= s_mean
