@@ -7,13 +7,14 @@ Nothing of the computer it runs on changes, and it is gone with its process. It 
 from __future__ import annotations
 
 import ctypes
+import json
 import os
 import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,7 @@ class Machine:
     """The namespace, by the process that holds it."""
 
     holder_pid: int
+    _sessions: dict[str, subprocess.Popen[str]] = field(default_factory=dict)
 
     def command(self, user: str, *words: str | Path) -> list[str]:
         """``words`` as ``user`` would start them."""
@@ -90,8 +92,29 @@ class Machine:
         )
 
     def graderd(self, user: str, *words: str | Path) -> subprocess.CompletedProcess[str]:
-        """``graderd`` with ``words``."""
-        return self.run(user, sys.executable, "-P", "-m", "graderd", *words)
+        """``graderd`` with ``words``, in the session of ``user`` (:mod:`tests.commands`)."""
+        if user not in self._sessions:
+            self._sessions[user] = subprocess.Popen(
+                ["nice", "-n", "10", *self.command(user, sys.executable, "-P", PROJECT / "tests" / "commands.py")],
+                env=environment(user),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+        session = self._sessions[user]
+        assert session.stdin is not None
+        assert session.stdout is not None
+        session.stdin.write(json.dumps([str(word) for word in words]) + "\n")
+        session.stdin.flush()
+        answer = json.loads(session.stdout.readline())
+        return subprocess.CompletedProcess(
+            ["graderd", *map(str, words)], answer["status"], answer["out"], answer["err"]
+        )
+
+    def end(self) -> None:
+        """End the users' sessions."""
+        for session in self._sessions.values():
+            session.communicate()
 
     def python(self, user: str, code: str, *words: str | Path) -> subprocess.CompletedProcess[str]:
         """A few lines of Python."""
@@ -166,7 +189,11 @@ def three_users() -> Iterator[Machine]:
             assert holder.stderr is not None
             if holder.stdout.readline() != "ready\n":
                 raise PermissionError(holder.stderr.read().strip())
-            yield Machine(holder.pid)
+            machine = Machine(holder.pid)
+            try:
+                yield machine
+            finally:
+                machine.end()
         finally:
             holder.kill()
 
