@@ -6,6 +6,7 @@ A line of standard input is a command's words (JSON); the answer, a line too, is
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
@@ -45,4 +46,7 @@ def next_command() -> list[str]:
 
 if __name__ == "__main__":
     _parser()  # a command keeps it for as long as it lives: as long as all of them live
+    # Three quarters of a forked command's time went into collecting what it was born with, at its end.
+    gc.collect()
+    gc.freeze()
     main(next_command())
