@@ -35,13 +35,23 @@ async def bus(rig: Bench) -> AsyncIterator[ServoBus]:
 @pytest.mark.xdist_group("a line")
 @pytest.mark.timeout(60)
 async def test_15_percent_loss_is_told_and_nothing_else_happens(tmp_path: Path) -> None:
-    """As many exchanges as in a minute at the default poll rate."""
-    async with bench(tmp_path, wire={"seed": 11}, poll_hz=200.0) as rig:
+    """As many exchanges as in a minute at the default poll rate, on three lines side by side."""
+    folders = [tmp_path / str(number) for number in range(3)]
+    for folder in folders:
+        folder.mkdir()
+    async with asyncio.TaskGroup() as lines:
+        for seed, folder in enumerate(folders, 11):
+            lines.create_task(_loses(folder, seed, 1667))
+
+
+async def _loses(folder: Path, seed: int, exchanges_n: int) -> None:
+    """A line of its own that loses 15 % of so many exchanges: told, and the servo is driven on."""
+    async with bench(folder, wire={"seed": seed}, poll_hz=200.0) as rig:
         await rig.rotator.arm()
         rig.bus.inject("drop", rate=0.08)
         rig.bus.inject("drop_requests", rate=0.08)
         from_n, told = rig.bus.requests_n, set[str]()
-        while rig.bus.requests_n - from_n < 5000:
+        while rig.bus.requests_n - from_n < exchanges_n:
             rig.rotator.set_goal_deg(5.0)
             await asyncio.sleep(0.02)
             told |= rig.conditions()
