@@ -80,7 +80,7 @@ run: $(STAMP) ## drive the demonstration on the simulated grader (ARGS=--json fo
 	@$(BIN)/graderd demo $(ARGS)
 
 test: $(STAMP) ## run the tests; run times by file at the end of each part
-	@$(IDLE) $(TESTS) $(BESIDE) -m pure $(PYTEST_ARGS) >$(VENV)/pure.log 2>&1 & pure=$$!; \
+	@$(IDLE) $(TESTS) $(BESIDE) -m pure $(or $(PYTEST_ARGS),tests/unit) >$(VENV)/pure.log 2>&1 & pure=$$!; \
 	$(TESTS) $(WAITING) -m "not whole_machine and not pure" $(PYTEST_ARGS); waiting=$$?; \
 	$(TESTS) $(MACHINES) -m whole_machine $(PYTEST_ARGS); whole=$$?; \
 	wait $$pure; pure=$$?; cat $(VENV)/pure.log; [ $$waiting -eq 0 ] && [ $$whole -eq 0 ] && [ $$pure -eq 0 ]

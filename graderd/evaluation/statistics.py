@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy import stats
+import scipy  # its statistics, a second of processor time, are imported where they are used first
 
 from graderd.evaluation.trial import TrialResult
 from graderd.evaluation.uncertainty import Estimate
@@ -79,7 +79,7 @@ def _row(case: str, measure: str, angle_deg: float, found: Sequence[Estimate], c
         return Row(case, angle_deg, measure, values, mean, None, low, high)
     deviation = float(np.std(values, ddof=1))
     if deviation > 0.0:
-        low, high = stats.t.interval(confidence, len(values) - 1, mean, deviation / math.sqrt(len(values)))
+        low, high = scipy.stats.t.interval(confidence, len(values) - 1, mean, deviation / math.sqrt(len(values)))
     else:
         low = high = mean
     return Row(case, angle_deg, measure, values, mean, deviation, float(low), float(high))
@@ -89,7 +89,7 @@ def interval(found: Estimate, confidence: float) -> tuple[float | None, float | 
     """Confidence interval of one measurement; None where its uncertainty is not known."""
     if not math.isfinite(found.deviation):
         return None, None
-    half = float(stats.t.ppf((1.0 + confidence) / 2.0, found.freedom_n)) * found.deviation
+    half = float(scipy.stats.t.ppf((1.0 + confidence) / 2.0, found.freedom_n)) * found.deviation
     return found.value - half, found.value + half
 
 
@@ -102,7 +102,7 @@ def differences_of(rows: Sequence[Row], confidence: float) -> list[Difference]:
         if len(group) < 2 or any(not row.deviation for row in group):
             continue
         samples = [row.values for row in group]
-        whole = stats.f_oneway(*samples, equal_var=False)
+        whole = scipy.stats.f_oneway(*samples, equal_var=False)
         pairs = tuple(_pair(a, b, len(group), confidence) for a, b in combinations(group, 2))
         found.append(Difference(case, measure, float(whole.statistic), float(whole.pvalue), pairs))
     return found
@@ -118,9 +118,9 @@ def _pair(one: Row, other: Row, angles_n: int, confidence: float) -> Pair:
     error = math.sqrt(sum(shares) / 2.0)
     difference = one.value - other.value
     if angles_n == 2:  # the range of two is Student's t, without an integral
-        half = float(stats.t.ppf((1.0 + confidence) / 2.0, freedom)) * math.sqrt(2.0) * error
-        p = 2.0 * float(stats.t.sf(abs(difference) / error / math.sqrt(2.0), freedom))
+        half = float(scipy.stats.t.ppf((1.0 + confidence) / 2.0, freedom)) * math.sqrt(2.0) * error
+        p = 2.0 * float(scipy.stats.t.sf(abs(difference) / error / math.sqrt(2.0), freedom))
     else:
-        half = float(stats.studentized_range.ppf(confidence, angles_n, freedom)) * error
-        p = float(stats.studentized_range.sf(abs(difference) / error, angles_n, freedom))
+        half = float(scipy.stats.studentized_range.ppf(confidence, angles_n, freedom)) * error
+        p = float(scipy.stats.studentized_range.sf(abs(difference) / error, angles_n, freedom))
     return Pair(one.angle_deg, other.angle_deg, difference, difference - half, difference + half, p)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 from graderd.evaluation.statistics import differences_of
 from graderd.evaluation.study import (
@@ -87,12 +87,12 @@ def test_a_verdict_follows_its_numbers(study: Study) -> None:
 
 def test_intervals_and_tests_are_those_of_the_textbook(study: Study) -> None:
     left = study.row("left", 30)
-    whole = stats.ttest_1samp(left.values, 0.0).confidence_interval(0.95)
+    whole = scipy.stats.ttest_1samp(left.values, 0.0).confidence_interval(0.95)
     assert (left.low, left.high) == pytest.approx((whole.low, whole.high))
     (difference,) = (each for each in study.differences if each.case == CASES["left"])
     pairs = {(pair.angle_deg, pair.other_deg): pair for pair in difference.pairs}
     assert list(pairs) == [(15.0, 30.0), (15.0, 45.0), (30.0, 45.0)]
-    welch = stats.ttest_ind(study.row("left", 30).values, study.row("left", 45).values, equal_var=False)
+    welch = scipy.stats.ttest_ind(study.row("left", 30).values, study.row("left", 45).values, equal_var=False)
     assert pairs[30.0, 45.0].difference == pytest.approx(61.38)
     assert pairs[30.0, 45.0].p > welch.pvalue  # adjusted for three pairs
     assert difference.p < 1e-6
@@ -109,7 +109,7 @@ def test_pairs_are_those_of_games_and_howell(study: Study, angles_n: int) -> Non
     for pair, (a, b) in zip(tested.pairs, combinations(range(angles_n), 2), strict=True):
         for shift, p in ((0.0, pair.p), (pair.low, 0.05), (pair.high, 0.05)):
             shifted = [*samples[:a], samples[a] - shift, *samples[a + 1 :]]
-            assert stats.tukey_hsd(*shifted, equal_var=False).pvalue[a, b] == pytest.approx(p, rel=1e-6)
+            assert scipy.stats.tukey_hsd(*shifted, equal_var=False).pvalue[a, b] == pytest.approx(p, rel=1e-6)
 
 
 def test_table_4_is_an_experiment_file_like_any_other() -> None:
