@@ -30,6 +30,9 @@ CONFIG = """\
 [api]
 socket = "{socket}"
 [camera]
+rate_hz = 8.0
+color_width_px = 640
+color_height_px = 400
 stale_s = 1.5
 restart_s = 15.0
 [perception.decision]
@@ -37,8 +40,8 @@ max_frame_age_s = 1.0
 [rule]
 vote_max_age_s = 5.0
 """
-"""Beside ten others a picture is half a second in the making, and comes twice a second instead of fifteen times. The
-machine stands while it looks: an older picture shows it the same soil."""
+"""Beside ten others a picture is half a second in the making, and comes twice a second. The machine stands while it
+looks: an older picture shows it the same soil, eight smaller ones a second all that happens to it."""
 ATTEMPTS_N = 5
 RECOVERY_S = 30.0
 """A pass that the machine broke off is driven anew, so often, once the machine could be armed again within this

@@ -73,22 +73,30 @@ class Served:
                 await asyncio.sleep(0.02)
 
     async def turn(self) -> None:
-        """Arm, and let automatic operation turn the blade to the even angle; returns in the middle of the turn."""
-        await self.until(lambda s: all(r.met for r in s.readiness if r.mandatory) and s.soil.frames_per_s > 0)
+        """Arm, and let automatic operation turn the blade to the even angle, or to the right one where it is past half
+        of the way already; returns in the middle of the turn."""
+        ready = await self.until(lambda s: all(r.met for r in s.readiness if r.mandatory) and s.soil.frames_per_s > 0)
+        from_deg = ready.axes["rotation"].measured or 0.0
         async with RigControl(self.directory / "control.sock") as rig:
-            await rig.request("scene", zone="even")
+            await rig.request("scene", zone="even" if from_deg < 20.0 else "right")
         await self.command("arm")
         await self.until(lambda s: s.mode == "manual")
         await self.command("auto")
-        await self.until(lambda s: (s.axes["rotation"].measured or 0.0) > 8.0)
+        await self.until(lambda s: abs((s.axes["rotation"].measured or 0.0) - from_deg) > 8.0)
 
 
 @dataclass
-class Machine(Served):
+class Attached(Served):
+    """A daemon as a process of its own, attached to a rig that others may use after it."""
+
+    daemon: asyncio.subprocess.Process
+
+
+@dataclass
+class Machine(Attached):
     """A rig and a daemon attached to it, as processes of their own, to be ended as a test likes."""
 
     rig: asyncio.subprocess.Process
-    daemon: asyncio.subprocess.Process
 
 
 async def start_rig(directory: Path) -> asyncio.subprocess.Process:
@@ -102,10 +110,16 @@ async def start_rig(directory: Path) -> asyncio.subprocess.Process:
     return rig
 
 
+async def _ended(process: asyncio.subprocess.Process) -> None:
+    if process.returncode is None:
+        process.kill()
+    await process.wait()
+
+
 @asynccontextmanager
-async def machine(directory: Path, more_config: str = "") -> AsyncIterator[Machine]:
-    """Start both, give the machine, end both whatever happened. ``more_config``: further TOML, of the camera too."""
-    rig = await start_rig(directory)
+async def attached(directory: Path, more_config: str = "") -> AsyncIterator[Attached]:
+    """Start a daemon on the rig in ``directory``, give it, end it whatever happened. ``more_config``: further TOML, of
+    the camera too."""
     socket_path = directory / "graderd.sock"
     config = CONFIG.format(socket=socket_path) + ("" if "[camera]" in more_config else PICTURES) + more_config
     (directory / "graderd.toml").write_text(config, encoding="utf-8")
@@ -113,15 +127,26 @@ async def machine(directory: Path, more_config: str = "") -> AsyncIterator[Machi
         *(sys.executable, "-m", "graderd", "run"),
         *("--config", str(directory / "graderd.toml"), "--rig-dir", str(directory)),
     )
-    async with AsyncClient(socket_path, name="test", timeout_s=10.0) as client:
-        whole = Machine(directory, client, rig, daemon)
-        try:
-            yield whole
-        finally:
-            for process in (whole.daemon, whole.rig):
-                if process.returncode is None:
-                    process.kill()
-                await process.wait()
+    try:
+        async with AsyncClient(socket_path, name="test", timeout_s=10.0) as client:
+            yield Attached(directory, client, daemon)
+    finally:
+        await _ended(daemon)
+
+
+@asynccontextmanager
+async def machine(directory: Path, more_config: str = "") -> AsyncIterator[Machine]:
+    """Start both, give the machine, end both whatever happened. ``more_config``: as for :func:`attached`."""
+    rig = await start_rig(directory)
+    try:
+        async with attached(directory, more_config) as one:
+            whole = Machine(directory, one.client, one.daemon, rig)
+            try:
+                yield whole
+            finally:
+                rig = whole.rig
+    finally:
+        await _ended(rig)
 
 
 @contextmanager

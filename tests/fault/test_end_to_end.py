@@ -21,7 +21,8 @@ import pytest
 
 from graderd.client import RefusedError
 from graderd.simulator.control_client import RigControl
-from tests.machine import READY_S, machine, start_rig
+from tests.machine import READY_S, attached, machine, start_rig
+from tests.rig_process import running_rig
 
 pytestmark = [pytest.mark.whole_machine, pytest.mark.timeout(240)]
 
@@ -31,6 +32,14 @@ def short_path() -> Iterator[Path]:
     """A folder whose name leaves a socket's name its room, as a worker's ``tmp_path`` does not."""
     with tempfile.TemporaryDirectory(prefix="graderd-test-") as folder:
         yield Path(folder)
+
+
+@pytest.fixture(scope="module")
+def grader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder of a rig for one daemon after the other."""
+    directory = tmp_path_factory.mktemp("grader")
+    with running_rig(directory):
+        yield directory
 
 
 @dataclass(frozen=True)
@@ -148,10 +157,10 @@ async def test_a_demonstration_ended_from_outside_says_so_and_leaves_nothing(sho
     assert list(short_path.iterdir()) == []
 
 
-async def test_the_servo_stops_by_its_own_watchdog_when_the_daemon_is_killed(tmp_path: Path) -> None:
-    async with machine(tmp_path) as whole:
+async def test_the_servo_stops_by_its_own_watchdog_when_the_daemon_is_killed(grader: Path) -> None:
+    async with attached(grader) as whole:
         await whole.turn()
-        async with RigControl(tmp_path / "control.sock") as rig:
+        async with RigControl(grader / "control.sock") as rig:
             moving = await rig.request("state")
             assert abs(moving["blade_velocity_deg_per_s"]) > 5.0
             whole.daemon.send_signal(signal.SIGKILL)
@@ -194,26 +203,26 @@ async def test_a_dead_rig_is_named_held_and_back_in_standby_when_it_returns(tmp_
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-async def test_a_signal_in_mid_turn_ends_everything_within_two_seconds(tmp_path: Path, number: signal.Signals) -> None:
-    async with machine(tmp_path) as whole:
+async def test_a_signal_in_mid_turn_ends_everything_within_two_seconds(grader: Path, number: signal.Signals) -> None:
+    async with attached(grader) as whole:
         await whole.turn()
         told_s = time.monotonic()
         whole.daemon.send_signal(number)
         status = await whole.daemon.wait()
         assert status == 0
         assert time.monotonic() - told_s < 2.0
-        async with RigControl(tmp_path / "control.sock") as rig:
+        async with RigControl(grader / "control.sock") as rig:
             state = await rig.request("state")
         assert abs(state["blade_velocity_deg_per_s"]) < 0.5
-        assert not (tmp_path / "graderd.sock").exists()
+        assert not (grader / "graderd.sock").exists()
 
 
-async def test_a_second_daemon_on_the_same_socket_says_so_and_disturbs_nothing(tmp_path: Path) -> None:
-    async with machine(tmp_path) as whole:
+async def test_a_second_daemon_on_the_same_socket_says_so_and_disturbs_nothing(grader: Path) -> None:
+    async with attached(grader) as whole:
         await whole.until(lambda s: all(a.lifecycle == "standby" for a in s.axes.values()))
         second = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "graderd", "run"),
-            *("--config", str(tmp_path / "graderd.toml"), "--rig-dir", str(tmp_path)),
+            *("--config", str(grader / "graderd.toml"), "--rig-dir", str(grader)),
             stderr=asyncio.subprocess.PIPE,
         )
         _, said = await second.communicate()
@@ -225,8 +234,8 @@ async def test_a_second_daemon_on_the_same_socket_says_so_and_disturbs_nothing(t
         assert status.mode == "disarmed"
 
 
-async def test_a_colour_method_that_nobody_measured_here_does_not_drive(tmp_path: Path) -> None:
-    async with machine(tmp_path, '[perception]\nmethod = "fast_color"\n') as whole:
+async def test_a_colour_method_that_nobody_measured_here_does_not_drive(grader: Path) -> None:
+    async with attached(grader, '[perception]\nmethod = "fast_color"\n') as whole:
         await whole.until(lambda s: all(r.met for r in s.readiness if r.mandatory))
         await whole.command("arm")
         await whole.until(lambda s: s.mode == "manual")

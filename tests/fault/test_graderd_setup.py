@@ -41,7 +41,7 @@ from tests.machine import PATIENT
 PATIENCE = {
     "recording": {"directory": ""},
     "stop_input": {"stale_s": 1.0},
-    "camera": {"stale_s": 3.0, "restart_s": 20.0},
+    "camera": {"rate_hz": 6.0, "stale_s": 3.0, "restart_s": 20.0},
     "perception": {"decision": {"max_frame_age_s": 1.0}},
     "rule": {"vote_max_age_s": 5.0},
 }
@@ -69,7 +69,8 @@ def daemons(folder: Path) -> list[int]:
 def test_from_nothing_to_an_automatic_pass(tmp_path: Path) -> None:
     """Left twice on the way and taken up again; nothing moves without a clear yes.
 
-    The file to begin with is that of ``graderd config init``, with patience for a busy machine and nothing else.
+    The file to begin with is that of ``graderd config init``, with patience for a busy machine and fewer pictures, and
+    nothing else.
     """
     (tmp_path / "grader.toml").write_text(merged(template(), {**PATIENCE, **tomllib.loads(PATIENT)}))
     with a_rig(tmp_path) as hands:
