@@ -34,7 +34,13 @@ from graderd.simulator.operator import Operator, Pass, PassFailedError, Way, end
 from graderd.simulator.show import LineShow, Show
 
 ANGLES_DEG = (15.0, 30.0, 45.0)
-ZONES = ("left", "center", "right")
+FLAT = "even"
+ZONES = ("left", "center", "right", FLAT)
+"""Where the soil lies: heaps to scatter, and a layer over the whole bed, to flatten."""
+TARGET_MM = 20.0
+"""Flattening: the plane that the blade is held at, in a layer twice as high."""
+SWATH = "{ x_mm = [-900, 100], y_mm = [-250, 250] }"
+"""What of the bed the blade has gone over at every angle up to 60 degrees, as the camera counts."""
 TRIALS_N = 5
 WAY = Way(distance_m=2.0, speed_m_per_s=1.0)
 SCANS_N = 5
@@ -69,6 +75,11 @@ class Trial:
         """Of its heap: the same for all angles, so that they are compared on the same soil."""
         return 100 * ZONES.index(self.zone) + self.number
 
+    @property
+    def height_mm(self) -> float:
+        """Of the blade over the ground."""
+        return TARGET_MM if self.zone == FLAT else 0.0
+
 
 def trials(angles_deg: Sequence[float], zones: Sequence[str], count: int) -> list[Trial]:
     """All of them, angle by angle. Soil on the right is met by the mirrored blade, as the rule does."""
@@ -82,7 +93,7 @@ def trials(angles_deg: Sequence[float], zones: Sequence[str], count: int) -> lis
 
 def rule_for(angle_deg: float) -> str:
     """The rule that turns to this angle wherever the soil lies."""
-    goals = {"left": angle_deg, "center": angle_deg, "right": -angle_deg}
+    goals = {"left": angle_deg, "center": angle_deg, "right": -angle_deg, FLAT: angle_deg}
     return "".join(f"{zone}_deg = {goal_deg:g}\n" for zone, goal_deg in goals.items())
 
 
@@ -121,7 +132,11 @@ class Folder:
         ]
         by_zone = sorted(wanted, key=lambda trial: (ZONES.index(trial.zone), abs(trial.angle_deg), trial.number))
         for zone, group in groupby(by_zone, key=lambda trial: trial.zone):
-            lines += ["", "[[case]]", f'name = "Scattering work (soil {zone})"', 'work = "scattering"']
+            if zone == FLAT:
+                lines += ["", "[[case]]", 'name = "Flattening work"', 'work = "flattening"']
+                lines += [f"target_height_mm = {TARGET_MM:g}", f"area = {SWATH}"]
+            else:
+                lines += ["", "[[case]]", f'name = "Scattering work (soil {zone})"', 'work = "scattering"']
             for trial in group:
                 told = self.done(trial)
                 assert told is not None
@@ -223,7 +238,7 @@ async def _one(operator: Operator, bed: Bed, trial: Trial, folder: Folder) -> Pa
         surface = seen_from_above(*await bed.heights())
         await asyncio.to_thread(_save, camera, surface, folder.path, f"{trial.name}-{state}")
 
-    driven = await operator.drive_pass(trial.zone, trial.seed, lambda: scan("before"))
+    driven = await operator.drive_pass(trial.zone, trial.seed, lambda: scan("before"), trial.height_mm)
     await scan("after")
     folder.finish(trial, driven)
     return driven
@@ -267,7 +282,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder; trials that are there are not driven again")
     parser.add_argument("--trials", type=int, default=TRIALS_N, help=f"at each angle (default {TRIALS_N})")
     parser.add_argument("--angles", type=_angles, default=ANGLES_DEG, metavar="DEG,...", help="default 15,30,45")
-    parser.add_argument("--zones", type=_zones, default=ZONES, metavar="ZONE,...", help="default left,center,right")
+    parser.add_argument(
+        "--zones", type=_zones, default=ZONES, metavar="ZONE,...", help="default left,center,right,even"
+    )
     parser.add_argument("--quick", action="store_true", help="one trial at each angle, soil on the left")
     parser.add_argument("--json", action="store_true", help="one JSON object a line")
     options = parser.parse_args(arguments)

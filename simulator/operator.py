@@ -47,6 +47,7 @@ RECOVERY_S = 30.0
 """A pass that the machine broke off is driven anew, so often, once the machine could be armed again within this
 time. A busy machine starves its own servo's watchdog or its camera; what is broken stays broken."""
 SETTLED_DEG = 0.5
+SETTLED_MM = 1.0
 SETTLED_FOR_S = 0.5
 
 
@@ -211,10 +212,17 @@ class Operator:
             status = await self.status()
             raise PassFailedError(f"{error}; {status.mode}: {status.reason}") from None
 
-    async def drive_pass(self, zone: str, seed: int = 0, laid: Callable[[], Awaitable[None]] | None = None) -> Pass:
+    async def drive_pass(
+        self,
+        zone: str,
+        seed: int = 0,
+        laid: Callable[[], Awaitable[None]] | None = None,
+        height_mm: float | None = None,
+    ) -> Pass:
         """One pass; anew where the machine stepped back from it by itself and has nothing any more that keeps it.
 
         ``seed``: of the heap's form. ``laid``: called once the soil lies there, before automatic operation begins.
+        ``height_mm``: of the blade over the ground; None: where it is.
 
         Raises:
             PassFailedError, ClientError: it did not come to its end.
@@ -224,7 +232,7 @@ class Operator:
             try:
                 if (await self.status()).mode == "disarmed":
                     await self.arm()
-                return await self._one_pass(zone, seed, laid)
+                return await self._one_pass(zone, seed, laid, height_mm)
             except (PassFailedError, ClientError) as error:
                 if attempt_n == ATTEMPTS_N or not await self._stepped_back():
                     raise
@@ -243,12 +251,16 @@ class Operator:
             await asyncio.sleep(POLL_S)
         return False
 
-    async def _one_pass(self, zone: str, seed: int, laid: Callable[[], Awaitable[None]] | None) -> Pass:
+    async def _one_pass(
+        self, zone: str, seed: int, laid: Callable[[], Awaitable[None]] | None, height_mm: float | None
+    ) -> Pass:
         """Square blade, new soil, automatic operation, settle, drive."""
         await self._command("manual")
         await self._rig.request("scene", zone="none")
         await self._rig.request("reset_vehicle")
-        await self._square()
+        await self._jog("rotate", 0.0, lambda s: s.axes["rotation"].measured, SETTLED_DEG)
+        if height_mm is not None:
+            await self._jog("height", height_mm, lambda s: s.attitude.height_mm, SETTLED_MM)
         await self._rig.request("scene", zone=zone, seed=seed)
         self._show.event("scene", zone=zone)
         if laid is not None:
@@ -288,20 +300,20 @@ class Operator:
             raise PassFailedError(why(status))
         return status
 
-    async def _square(self) -> None:
-        """Jog the blade back to 0. A renewal that came late on a busy machine ended the jog: it begins anew."""
+    async def _jog(self, axis: str, goal: float, measured: Callable[[Status], float | None], within: float) -> None:
+        """Jog the blade there. A renewal that came late on a busy machine ended the jog: it begins anew."""
         deadline_s = time.monotonic() + STALLED_S
         while True:
             try:
                 async with self._client.lease() as lease:
-                    await lease.jog("rotate", 0.0)
+                    await lease.jog(axis, goal)
                     async for status in lease.statuses():
                         self._show.status(status)
-                        measured = status.axes["rotation"].measured
-                        if measured is not None and abs(measured) < SETTLED_DEG:
+                        there = measured(status)
+                        if there is not None and abs(there - goal) < within:
                             return
                         if time.monotonic() > deadline_s:
-                            raise PassFailedError(f"the blade did not come back to 0°: {'; '.join(status.holding)}")
+                            raise PassFailedError(f"{axis} did not come to {goal:g}: {'; '.join(status.holding)}")
             except LeaseLostError:
                 if (await self.status()).mode != "manual" or time.monotonic() > deadline_s:
                     raise

@@ -65,24 +65,6 @@ class Trial(_Model):
         return self
 
 
-class Case(_Model):
-    """One kind of work on one distribution of soil: a block of rows in the table."""
-
-    name: Annotated[str, Field(min_length=1, max_length=120)]
-    work: Literal["flattening", "scattering"]
-    target_height_mm: float | None = None
-    """Flattening: the target plane's height above the ground."""
-    trial: tuple[Trial, ...]
-
-    _some = field_validator("trial")(_at_least_one)
-
-    @model_validator(mode="after")
-    def _has_a_target(self) -> Self:
-        if self.work == "flattening" and self.target_height_mm is None and any(trial.after for trial in self.trial):
-            raise ValueError("flattening is judged against a plane; set target_height_mm, its height above the ground")
-        return self
-
-
 class Area(_Model):
     """The part of the bed that is looked at, in the bed frame: origin at the foot of the sensor, x forward, y left."""
 
@@ -95,6 +77,26 @@ class Area(_Model):
         if value is not None and value[0] >= value[1]:
             raise ValueError("write the smaller end first")
         return value
+
+
+class Case(_Model):
+    """One kind of work on one distribution of soil: a block of rows in the table."""
+
+    name: Annotated[str, Field(min_length=1, max_length=120)]
+    work: Literal["flattening", "scattering"]
+    target_height_mm: float | None = None
+    """Flattening: the target plane's height above the ground."""
+    area: Area | None = None
+    """In place of the experiment's."""
+    trial: tuple[Trial, ...]
+
+    _some = field_validator("trial")(_at_least_one)
+
+    @model_validator(mode="after")
+    def _has_a_target(self) -> Self:
+        if self.work == "flattening" and self.target_height_mm is None and any(trial.after for trial in self.trial):
+            raise ValueError("flattening is judged against a plane; set target_height_mm, its height above the ground")
+        return self
 
 
 class Experiment(_Model):

@@ -51,7 +51,8 @@ th { font-weight: 600; border-bottom-color: #8b949e; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
 td.mean { font-weight: 600; } .sure { font-weight: 600; }
 figure { margin: .6rem 0; display: inline-block; vertical-align: top; }
-.maps figure { margin-right: 1.4rem; } img { display: block; image-rendering: pixelated; border: 1px solid #d0d7de; }
+.maps figure { margin-right: 1.4rem; } .states { display: flex; gap: .5rem; font-size: .8rem; color: #57606a; }
+ img { display: block; image-rendering: pixelated; border: 1px solid #d0d7de; }
 svg text { font: 12px system-ui, sans-serif; fill: #57606a; }
 """
 
@@ -257,32 +258,57 @@ def _maps_html(trials: Sequence[TrialResult], experiment: Experiment) -> str:
     if flat:  # about the target, as far as the layer goes: a few millimetres show
         layer = np.abs(every[every > -(case.target_height_mm or 0.0) / 2.0])
         reach = max(5.0, 1.5 * float(np.percentile(layer, 90))) if layer.size else 5.0
-        low, high, what = -reach, reach, "height above the target plane"
+        low, high, what = -reach, reach, "Height above the target plane"
     else:
-        low, high, what = 0.0, max(10.0, float(np.percentile(every, 99.5))), "height above the ground"
-    figures = [
-        f"<figure>{_picture(trial, low, high, flat)}<figcaption>{trial.angle_deg:g}°, trial {trial.number}, "
-        f"{trial.scans_n} scan{'s' * (trial.scans_n != 1)}</figcaption></figure>"
+        low, high, what = 0.0, max(10.0, float(np.percentile(every, 99.5))), "Height above the ground"
+    changes = [
+        (trial.map_mm - trial.before_mm) if trial.map_mm is not None and trial.before_mm is not None else None
         for trial in shown
     ]
-    scale = _data(_colored(np.linspace(low, high, 200)[None, :].repeat(10, axis=0), low, high, flat))
+    moved = np.concatenate([change[np.isfinite(change)] for change in changes if change is not None] or [every])
+    most = max(10.0, float(np.percentile(np.abs(moved), 99.5)))
+    figures = []
+    for trial, change in zip(shown, changes, strict=True):
+        states = [
+            _picture(trial, name, heights, ends, about)
+            for name, heights, ends, about in (
+                ("before", trial.before_mm, (low, high), flat),
+                ("after", trial.map_mm, (low, high), flat),
+                ("difference", change, (-most, most), True),
+            )
+            if heights is not None
+        ]
+        volume = trial.values.get("volume_moved_l")
+        told = "" if volume is None else f", {number(volume.value)} l moved"
+        figures.append(
+            f"<figure><div class=states>{''.join(states)}</div><figcaption>{trial.angle_deg:g}°, trial {trial.number}, "
+            f"{trial.scans_n} scan{'s' * (trial.scans_n != 1)}{told}</figcaption></figure>"
+        )
+    scales = _scale(what, low, high, flat)
+    if any(change is not None for change in changes):
+        scales += "; difference, after less before: " + _scale("", -most, most, True)
     return (
-        f"<h3>Maps</h3><p>{what}, seen from above, forward up. {low:.0f} mm "
-        f"<img src='{scale}' alt='' width=200 height=10 style='display:inline-block'> {high:.0f} mm; grey: not "
-        "seen.</p>"
-        f"<div class=maps>{''.join(figures)}</div>"
+        f"<h3>Maps</h3><p>Seen from above, forward up; before the pass where it was scanned, after it, and the "
+        f"difference. {scales}; grey: not seen.</p><div class=maps>{''.join(figures)}</div>"
     )
 
 
-def _picture(trial: TrialResult, low: float, high: float, flat: bool) -> str:
-    assert trial.map_mm is not None
+def _scale(what: str, low: float, high: float, about: bool) -> str:
+    """What the colours mean; ``about``: a middle that is white."""
+    colors = _data(_colored(np.linspace(low, high, 200)[None, :].repeat(10, axis=0), low, high, about))
+    image = f"<img src='{colors}' alt='' width=200 height=10 style='display:inline-block'>"
+    return f"{what}{': ' * bool(what)}{low:.0f} mm {image} {high:.0f} mm"
+
+
+def _picture(trial: TrialResult, name: str, heights: F64, ends: tuple[float, float], about: bool) -> str:
     assert trial.grid is not None
-    colored = _colored(trial.map_mm[::-1, ::-1], low, high, flat)
+    colored = _colored(heights[::-1, ::-1], *ends, about)
     rows, columns = colored.shape[:2]
-    width = 280
+    width = 210
     wide_m = columns * trial.grid.cell_mm / 1000.0
-    label = f"map after trial {trial.number} at {trial.angle_deg:g} degrees, {wide_m:.1f} m wide"
-    return f"<img src='{_data(colored)}' alt='{label}' width={width} height={max(1, round(width * rows / columns))}>"
+    label = f"{name}, trial {trial.number} at {trial.angle_deg:g} degrees, {wide_m:.1f} m wide"
+    height = max(1, round(width * rows / columns))
+    return f"<div>{name}<img src='{_data(colored)}' alt='{label}' width={width} height={height}></div>"
 
 
 def _colored(heights: F64, low: float, high: float, flat: bool) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:

@@ -33,7 +33,8 @@ from graderd.hal.errors import DeviceMissingError, ProtocolError
 @dataclass(frozen=True, slots=True, eq=False)
 class TrialResult:
     """What one trial came to. ``number``: among those of its case and angle, from 1. ``map_mm``: heights after the
-    pass, above the target plane where there is one, else above the ground; None for a trial without scans."""
+    pass, above the target plane where there is one, else above the ground; None for a trial without scans.
+    ``before_mm``: the same before the pass, of the same cells; None without scans of that."""
 
     case: str
     angle_deg: float
@@ -41,6 +42,7 @@ class TrialResult:
     values: Mapping[str, Estimate]
     grid: Grid | None = None
     map_mm: F64 | None = None
+    before_mm: F64 | None = None
     scans_n: int = 0
 
 
@@ -83,7 +85,7 @@ class _Work:
     ) -> None:
         self._experiment, self._case, self._trial = experiment, case, trial
         self._reader, self._folder, self._where = reader, folder, where
-        area = experiment.area
+        area = case.area or experiment.area
         self._rules = Rules(
             experiment.edge_mm,
             Interval(*area.x_mm) if area.x_mm else EVERYWHERE,
@@ -110,8 +112,18 @@ class _Work:
         except NothingThereError as error:
             remedy = "Look at the scans, at area and at edge_mm"
             raise ProtocolError(self._where, str(error), remedy) from None
-        shown = beds[-1].heights_mm - (self._case.target_height_mm or 0.0)
-        return TrialResult(self._case.name, trial.angle_deg, number, seen | values, grid, shown, len(states[-1]))
+        target_mm = self._case.target_height_mm or 0.0
+        *before, after = (bed.heights_mm - target_mm for bed in beds)
+        return TrialResult(
+            self._case.name,
+            trial.angle_deg,
+            number,
+            seen | values,
+            grid,
+            after,
+            before[0] if before else None,
+            len(states[-1]),
+        )
 
     def _measures(self, beds: Sequence[Bed], maps: Sequence[F64]) -> dict[str, float]:
         bed, after, rules = beds[-1], maps[-1], self._rules

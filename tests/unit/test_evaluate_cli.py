@@ -125,7 +125,12 @@ def test_files_for_spreadsheets_and_a_page(results: Path) -> None:
     assert "Flattening work,height_difference_mm,15,45,-6" in differences
     html = (out / "index.html").read_text("utf-8")
     assert html.count("<svg") == len({(row["case"], row["measure"]) for row in rows})
-    assert html.count("data:image/png;base64,") == 5 + 2  # a map for each trial with scans, a scale for each case
+    # A map for each trial with scans, before and difference for the one that has scans of before, a scale for each case
+    # and one for the difference.
+    assert html.count("data:image/png;base64,") == 5 + 2 + 2 + 1
+    told = re.findall(r"alt='(before|after|difference), trial 1 at 15 degrees", html)
+    assert told == ["before", "after", "difference"]
+    assert re.search(r"15°, trial 1, 3 scans, \d+\.\d+ l moved", html)
     assert "nan" not in re.sub(r"base64,[^']+", "", html)
     assert "http" not in html  # needs nothing beside it
 
