@@ -30,17 +30,18 @@ from graderd.runtime.app.sim import new_rig_directory
 from graderd.simulator.camera.top import F64, Surface, TopCamera, save
 from graderd.simulator.control_client import RigControl
 from graderd.simulator.grader.world import START_X_M
-from graderd.simulator.operator import Operator, Pass, PassFailedError, Way, ended_by_sigterm, whole_machine
+from graderd.simulator.operator import Mound, Operator, Pass, PassFailedError, Way, ended_by_sigterm, whole_machine
 from graderd.simulator.show import LineShow, Show
 
 ANGLES_DEG = (15.0, 30.0, 45.0)
 FLAT = "even"
 ZONES = ("left", "center", "right", FLAT)
-"""Where the soil lies: heaps to scatter, and a layer over the whole bed, to flatten."""
+"""Where the soil lies: heaps to scatter, and a low mound wider than the blade, to flatten."""
 TARGET_MM = 20.0
-"""Flattening: the plane that the blade is held at, in a layer twice as high."""
-SWATH = "{ x_mm = [-900, 100], y_mm = [-250, 250] }"
-"""What of the bed the blade has gone over at every angle up to 60 degrees, as the camera counts."""
+"""Flattening: the plane that the blade is held at."""
+MOUND = Mound({"x_m": 1.0, "y_m": 0.0, "length_m": 1.8, "width_m": 1.4, "height_m": 0.06}, TARGET_MM)
+SWATH = "{ x_mm = [-1000, 0], y_mm = [-250, 250] }"
+"""What of it the blade has gone over at every angle up to 60 degrees, as the camera counts."""
 TRIALS_N = 5
 WAY = Way(distance_m=2.0, speed_m_per_s=1.0)
 SCANS_N = 5
@@ -76,9 +77,9 @@ class Trial:
         return 100 * ZONES.index(self.zone) + self.number
 
     @property
-    def height_mm(self) -> float:
-        """Of the blade over the ground."""
-        return TARGET_MM if self.zone == FLAT else 0.0
+    def mound(self) -> Mound | None:
+        """What is to be flattened in it."""
+        return MOUND if self.zone == FLAT else None
 
 
 def trials(angles_deg: Sequence[float], zones: Sequence[str], count: int) -> list[Trial]:
@@ -134,7 +135,7 @@ class Folder:
         for zone, group in groupby(by_zone, key=lambda trial: trial.zone):
             if zone == FLAT:
                 lines += ["", "[[case]]", 'name = "Flattening work"', 'work = "flattening"']
-                lines += [f"target_height_mm = {TARGET_MM:g}", f"area = {SWATH}"]
+                lines += [f"target_height_mm = {TARGET_MM:g}", f"layer = {SWATH}"]
             else:
                 lines += ["", "[[case]]", f'name = "Scattering work (soil {zone})"', 'work = "scattering"']
             for trial in group:
@@ -238,7 +239,7 @@ async def _one(operator: Operator, bed: Bed, trial: Trial, folder: Folder) -> Pa
         surface = seen_from_above(*await bed.heights())
         await asyncio.to_thread(_save, camera, surface, folder.path, f"{trial.name}-{state}")
 
-    driven = await operator.drive_pass(trial.zone, trial.seed, lambda: scan("before"), trial.height_mm)
+    driven = await operator.drive_pass(trial.zone, trial.seed, lambda: scan("before"), trial.mound)
     await scan("after")
     folder.finish(trial, driven)
     return driven

@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -70,6 +70,14 @@ class Pass:
     def told(self) -> dict[str, Any]:
         """For an event: without the states."""
         return {name: getattr(self, name) for name in ("zone", "decided", "requested_deg", "measured_deg", "settle_s")}
+
+
+@dataclass(frozen=True, slots=True)
+class Mound:
+    """Soil to flatten: the heap that the rig is to pour, and the blade's height over the ground to go over it at."""
+
+    heap: Mapping[str, float]
+    blade_mm: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,12 +225,12 @@ class Operator:
         zone: str,
         seed: int = 0,
         laid: Callable[[], Awaitable[None]] | None = None,
-        height_mm: float | None = None,
+        mound: Mound | None = None,
     ) -> Pass:
         """One pass; anew where the machine stepped back from it by itself and has nothing any more that keeps it.
 
         ``seed``: of the heap's form. ``laid``: called once the soil lies there, before automatic operation begins.
-        ``height_mm``: of the blade over the ground; None: where it is.
+        ``mound``: to flatten, in place of what the rig lays for the zone.
 
         Raises:
             PassFailedError, ClientError: it did not come to its end.
@@ -232,7 +240,7 @@ class Operator:
             try:
                 if (await self.status()).mode == "disarmed":
                     await self.arm()
-                return await self._one_pass(zone, seed, laid, height_mm)
+                return await self._one_pass(zone, seed, laid, mound)
             except (PassFailedError, ClientError) as error:
                 if attempt_n == ATTEMPTS_N or not await self._stepped_back():
                     raise
@@ -252,16 +260,18 @@ class Operator:
         return False
 
     async def _one_pass(
-        self, zone: str, seed: int, laid: Callable[[], Awaitable[None]] | None, height_mm: float | None
+        self, zone: str, seed: int, laid: Callable[[], Awaitable[None]] | None, mound: Mound | None
     ) -> Pass:
         """Square blade, new soil, automatic operation, settle, drive."""
         await self._command("manual")
         await self._rig.request("scene", zone="none")
         await self._rig.request("reset_vehicle")
         await self._jog("rotate", 0.0, lambda s: s.axes["rotation"].measured, SETTLED_DEG)
-        if height_mm is not None:
-            await self._jog("height", height_mm, lambda s: s.attitude.height_mm, SETTLED_MM)
-        await self._rig.request("scene", zone=zone, seed=seed)
+        if mound is None:
+            await self._rig.request("scene", zone=zone, seed=seed)
+        else:
+            await self._jog("height", mound.blade_mm, lambda s: s.attitude.height_mm, SETTLED_MM)
+            await self._rig.request("place", **mound.heap, seed=seed)
         self._show.event("scene", zone=zone)
         if laid is not None:
             await laid()

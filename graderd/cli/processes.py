@@ -120,7 +120,8 @@ def _rig(app: typer.Typer) -> None:
 
         Soil, blade, camera, virtual servo and virtual actuators in a process of their own, which announces itself in
         rig.json in its directory (a JSON object). 'dataset' writes a set of labelled frames instead; 'experiment'
-        drives passes over soil left, center and right at three angles with its own daemon and measures them. 'scene',
+        drives passes over soil left, center, right and even at three angles with its own daemon and measures them.
+        'scene',
         'drive', 'halt', 'turn', 'press', 'release', 'unplug' and 'plug' do at the rig of the daemon that runs, or at
         that of --dir, what a person does at a machine. Further arguments are the rig's own.
         """

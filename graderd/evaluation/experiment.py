@@ -86,8 +86,9 @@ class Case(_Model):
     work: Literal["flattening", "scattering"]
     target_height_mm: float | None = None
     """Flattening: the target plane's height above the ground."""
-    area: Area | None = None
-    """In place of the experiment's."""
+    layer: Area | None = None
+    """Flattening: the part whose height is judged, where the work went over no more of it; the experiment's ``area``
+    otherwise."""
     trial: tuple[Trial, ...]
 
     _some = field_validator("trial")(_at_least_one)

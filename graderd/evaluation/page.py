@@ -144,14 +144,13 @@ def html(
     for case, measure in dict.fromkeys((row.case, row.measure) for row in rows):
         if not any(f"<h2>{escape(case)}</h2>" in part for part in parts):
             parts.append(f"<h2>{escape(case)}</h2>")
+            parts.append(_maps_html([trial for trial in trials if trial.case == case], experiment))
         group = [row for row in rows if (row.case, row.measure) == (case, measure)]
         definition = definition_of(measure, experiment)
         parts.append(f"<h3>{escape(title_of(measure))}</h3>" + (f"<p>{escape(definition)}</p>" if definition else ""))
         tested = [_difference_html(d, percent, group) for d in differences if (d.case, d.measure) == (case, measure)]
         tables = "".join((_rows_html(group, percent), *tested))
         parts.append(f"<div class=beside><div>{tables}</div>{_plot(group, angles)}</div>")
-        if measure == list(dict.fromkeys(row.measure for row in rows if row.case == case))[-1]:
-            parts.append(_maps_html([trial for trial in trials if trial.case == case], experiment))
     return "\n".join(parts) + "\n</body></html>\n"
 
 
@@ -304,7 +303,7 @@ def _picture(trial: TrialResult, name: str, heights: F64, ends: tuple[float, flo
     assert trial.grid is not None
     colored = _colored(heights[::-1, ::-1], *ends, about)
     rows, columns = colored.shape[:2]
-    width = 210
+    width = 120
     wide_m = columns * trial.grid.cell_mm / 1000.0
     label = f"{name}, trial {trial.number} at {trial.angle_deg:g} degrees, {wide_m:.1f} m wide"
     height = max(1, round(width * rows / columns))

@@ -12,7 +12,7 @@ import numpy as np
 
 from graderd.evaluation.bed import Bed, Grid, Points, bed_of, common_grid
 from graderd.evaluation.depth_files import Reader, find, span_of
-from graderd.evaluation.experiment import Case, Experiment, Trial
+from graderd.evaluation.experiment import Area, Case, Experiment, Trial
 from graderd.evaluation.ground import F64, NoGroundError
 from graderd.evaluation.load import load
 from graderd.evaluation.measures import (
@@ -79,18 +79,22 @@ def _scans(reader: Reader, folder: Path, names: Iterable[str], where: str) -> li
     return found
 
 
+def _rules(experiment: Experiment, area: Area) -> Rules:
+    return Rules(
+        experiment.edge_mm,
+        Interval(*area.x_mm) if area.x_mm else EVERYWHERE,
+        Interval(*area.y_mm) if area.y_mm else EVERYWHERE,
+    )
+
+
 class _Work:
     def __init__(
         self, experiment: Experiment, case: Case, trial: Trial, reader: Reader, folder: Path, where: str
     ) -> None:
         self._experiment, self._case, self._trial = experiment, case, trial
         self._reader, self._folder, self._where = reader, folder, where
-        area = case.area or experiment.area
-        self._rules = Rules(
-            experiment.edge_mm,
-            Interval(*area.x_mm) if area.x_mm else EVERYWHERE,
-            Interval(*area.y_mm) if area.y_mm else EVERYWHERE,
-        )
+        self._rules = _rules(experiment, experiment.area)
+        self._layer = _rules(experiment, case.layer or experiment.area)
 
     def result(self, number: int, bare: Sequence[Points]) -> TrialResult:
         trial = self._trial
@@ -131,7 +135,7 @@ class _Work:
         found: dict[str, float] = {}
         if self._case.work == "flattening":
             target_mm = self._case.target_height_mm or 0.0
-            found |= height_difference(after, grid, target_mm, noise, bed.cell_noise_mm, rules)
+            found |= height_difference(after, grid, target_mm, noise, bed.cell_noise_mm, self._layer)
             found |= windrow(after, grid, noise, rules)
         else:
             found |= spread(after, grid, noise, rules, self._experiment.spread, self._blade())

@@ -19,6 +19,8 @@ from graderd.simulator.experiment import (
     CAMERA_HEIGHT_M,
     CAMERA_X_M,
     EXPERIMENT,
+    TARGET_MM,
+    ZONES,
     Folder,
     Trial,
     main,
@@ -63,18 +65,41 @@ def test_the_soil_is_where_the_bed_has_it_and_as_wide(tmp_path: Path) -> None:
     assert result.values["volume_moved_l"].value == pytest.approx(0.0, abs=1.0)
 
 
+def test_flattening_is_measured_where_the_blade_went_and_stands_beside_scattering(tmp_path: Path) -> None:
+    """A mound with a swath through it, 3 mm too high: what the blade left at both sides is no part of the layer."""
+    field, folder = SoilField(), Folder(tmp_path)
+    along = np.clip((0.9 - np.abs(field.x_m - CAMERA_X_M + 0.4)) / 0.1, 0.0, 1.0)
+    mound = 0.06 * np.outer(along, np.clip((0.7 - np.abs(field.y_m)) / 0.1, 0.0, 1.0))
+    left = np.where(np.abs(field.y_m) < 0.35, np.minimum(mound, TARGET_MM / 1e3 + 0.003), mound)
+    before, after = (seen_from_above(heights, field.cell_m) for heights in (mound, left))
+    camera, trial = TopCamera(height_mm=CAMERA_HEIGHT_M * 1e3, noise_px=0.1), Trial("even", 30.0, 1)
+    for state, surface in (("before", before), ("after", after)):
+        save(folder.path, f"{trial.name}-{state}", camera.scans_mm(surface, 2))
+    folder.finish(trial, PASS)
+    scanned(folder, Trial("left", 30.0, 1), _heap())
+    found = evaluate_trials(file.load(folder.write_experiment([trial, Trial("left", 30.0, 1)])), tmp_path)
+    scattering, flattening = found
+    assert [each.case for each in found] == ["Scattering work (soil left)", "Flattening work"]
+    assert "spread_extreme_mm" in scattering.values
+    assert flattening.values["height_difference_mm"].value == pytest.approx(3.0, abs=1.0)
+    assert flattening.values["volume_moved_l"].value == pytest.approx(
+        float((mound - left).sum()) * field.cell_m**2 * 1e3, rel=0.05
+    )
+
+
 def test_trials_are_told_from_one_another_and_compared_on_the_same_soil() -> None:
-    wanted = trials((15.0, 30.0, 45.0), ("left", "center", "right"), 5)
-    assert len({trial.name for trial in wanted}) == 45
+    wanted = trials((15.0, 30.0, 45.0), ZONES, 5)
+    assert len({trial.name for trial in wanted}) == 60
+    assert [trial.mound is not None for trial in wanted] == [trial.zone == "even" for trial in wanted]
     assert {trial.angle_deg < 0 for trial in wanted if trial.zone == "right"} == {True}
-    assert len({trial.seed for trial in wanted}) == 15
+    assert len({trial.seed for trial in wanted}) == 20
 
 
 @pytest.mark.parametrize("angle_deg", [15.0, 45.0])
 def test_the_rule_under_test_turns_to_the_angle_wherever_the_soil_lies(angle_deg: float) -> None:
     rule = parse({"rule": dict(line.split(" = ") for line in rule_for(angle_deg).splitlines())}).rule
-    found = [rule.angle_deg(zone) for zone in (Zone.LEFT, Zone.CENTER, Zone.RIGHT)]
-    assert found == [angle_deg, angle_deg, -angle_deg]
+    found = [rule.angle_deg(zone) for zone in (Zone.LEFT, Zone.CENTER, Zone.RIGHT, Zone.EVEN)]
+    assert found == [angle_deg, angle_deg, -angle_deg, angle_deg]
 
 
 def test_a_trial_that_was_broken_off_is_none(tmp_path: Path) -> None:
