@@ -318,6 +318,14 @@ CLAIMS: Final = (
         "one wrong picture decides",
     ),
     Mutant(
+        "F11-sleep",
+        "graderd/runtime/health.py",
+        "        if slept_s > self._slept_s + SLEPT_LEAST_S:\n",
+        "        if False:\n",
+        (CONTROL + "test_after_a_sleep_of_the_computer_nothing_goes_on",),
+        "after a sleep of the computer an hour old lease goes on",
+    ),
+    Mutant(
         "F11-afterwards-may-fail",
         "graderd/runtime/app/daemon.py",
         '            except Exception:\n                log.exception("after a tick: failed")\n',
@@ -649,7 +657,7 @@ CLAIMS: Final = (
     Mutant(
         "I16-own-standstill",
         "graderd/core/machine.py",
-        'if f.present and f.name == STANDSTILL), "")',
+        'if f.present and f.name in STANDSTILLS), "")',
         'if False), "")',
         (CONTROL + "test_after_a_freeze_the_reason_is_the_freeze",),
         "after a freeze a person is sent to a device that is well",

@@ -32,7 +32,7 @@ class Mode(StrEnum):
 
 
 ARMED = (Mode.MANUAL, Mode.AUTO)
-STANDSTILL = "daemon.loop_blocked"
+STANDSTILLS = ("daemon.suspended", "daemon.loop_blocked")
 NOTHING_HELD: Mapping[str, str] = MappingProxyType({})
 
 
@@ -198,7 +198,7 @@ def _react_stopping(state: State, stopping: list[ActiveFault]) -> State:
 def _own_standstill(inputs: Inputs) -> str:
     """Why devices seem lost just after the daemon itself stood still; empty where it did not. Their silence is its own
     deafness: nobody needs to look at their power for that, and a device that is really lost is told afterwards."""
-    return next((f"{f.name}: {f.row.reads}" for f in inputs.faults if f.present and f.name == STANDSTILL), "")
+    return next((f"{f.name}: {f.row.reads}" for f in inputs.faults if f.present and f.name in STANDSTILLS), "")
 
 
 def _lapse(state: State, now_s: float) -> State:

@@ -1,4 +1,5 @@
-"""Watches the daemon's own process: memory, steps of the wall clock, where its event loop hangs. Changes nothing."""
+"""Watches the daemon's own process: memory, steps of the wall clock, sleep of the computer, where its event loop hangs.
+Changes nothing."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ import faulthandler
 import resource
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from graderd.config import Config
@@ -23,7 +25,7 @@ class HealthWatch:
 
     def __init__(self, config: Config) -> None:
         self._limit_mb = config.control.memory_warn_mb
-        self._offset_s = time.time() - time.monotonic()
+        self._offset_s = _wall_offset_s()
         self._faults = PresentFaults("daemon")
 
     async def run(self) -> None:
@@ -35,7 +37,7 @@ class HealthWatch:
     def measure(self) -> None:
         """Take one measurement."""
         now_s = time.monotonic()
-        offset_s = time.time() - now_s
+        offset_s = _wall_offset_s()
         step_s, self._offset_s = offset_s - self._offset_s, offset_s
         if abs(step_s) > STEP_S:
             self._faults.tell("clock_stepped", f"the wall clock was stepped by {step_s:+.0f} s", now_s, STEP_SHOWN_S)
@@ -45,6 +47,40 @@ class HealthWatch:
 
     def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
         """What was seen."""
+        return self._faults.present(now_s)
+
+
+def _wall_offset_s() -> float:
+    """The wall clock goes on while the computer sleeps, as does the clock since boot: that is no step."""
+    return time.time() - time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+SLEPT_LEAST_S = 0.01
+"""The clocks tell nanoseconds, and what is measured is never more than what was slept: less is nothing."""
+
+
+def slept_s() -> float:
+    """For how long the computer has slept since it was started: CLOCK_MONOTONIC, by which everything here goes, stands
+    still meanwhile and CLOCK_BOOTTIME does not. Never too much: a pause between the two readings makes it less."""
+    boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    return (boot_ns - time.monotonic_ns()) * 1e-9
+
+
+class SleepWatch:
+    """Tells that the computer slept, in the tick after it: by the monotonic clock no time went by, so that readings,
+    pictures and leases from before look fresh, however old they are. ``slept_s``: see :func:`slept_s`."""
+
+    def __init__(self, slept_s: Callable[[], float] = slept_s) -> None:
+        self._read = slept_s
+        self._slept_s = slept_s()
+        self._faults = PresentFaults("daemon")
+
+    def faults(self, now_s: float) -> tuple[DeviceFault, ...]:
+        """What was seen; to be asked in every tick."""
+        slept_s = self._read()
+        if slept_s > self._slept_s + SLEPT_LEAST_S:
+            self._faults.tell("suspended", f"it slept for {slept_s - self._slept_s:.1f} s", now_s)
+        self._slept_s = max(self._slept_s, slept_s)
         return self._faults.present(now_s)
 
 

@@ -1,8 +1,9 @@
 """The daemon with handles for what cannot be done to a process from outside: ``python -m harness.campaign.daemon``.
 
 Nothing of the product knows of this. On SIGUSR1 the process does what ``hook.json`` in its rig's directory says:
-``block_s`` stops the event loop, ``clock_step_s`` shows the daemon a stepped wall clock, ``memory_mb`` takes memory,
-``disk_full`` says that no space is left, ``disk_stalled`` has no write to a recording answered.
+``block_s`` stops the event loop, ``clock_step_s`` shows the daemon a stepped wall clock, ``slept_s`` a sleep of the
+computer, ``memory_mb`` takes memory, ``disk_full`` says that no space is left, ``disk_stalled`` has no write to a
+recording answered.
 ``GRADERD_CAMPAIGN_BREAK`` spoils one safety reaction, to prove that the campaign notices (see ``BREAKS``).
 """
 
@@ -66,6 +67,8 @@ class Hooks:
         self._disk_usage = shutil.disk_usage
         self._write = os.write
         self._step_s = 0.0
+        self._clock_ns = time.clock_gettime_ns
+        self._slept_ns = 0
 
     def on_signal(self, _: int, __: FrameType | None) -> None:
         """Runs in the main thread, between two instructions of the event loop."""
@@ -76,6 +79,10 @@ class Hooks:
             self._step_s += wanted["clock_step_s"]
             step_s = self._step_s
             time.time = lambda: self._time() + step_s
+        if "slept_s" in wanted:
+            self._slept_ns += int(wanted["slept_s"] * 1e9)
+            boot_ns, slept_ns = self._clock_ns, self._slept_ns
+            time.clock_gettime_ns = lambda clock: boot_ns(clock) + slept_ns * (clock == time.CLOCK_BOOTTIME)
         if "disk_full" in wanted:
             usage = self._disk_usage
             # Less than nothing: below any limit that may be configured, 0 included.

@@ -368,6 +368,7 @@ DAEMON = (
             detect_s=1.6, recover_s=14.0),
     _daemon("clock_back", "the wall clock is set 1 h back", "daemon.clock_stepped", hook(clock_step_s=-3600.0),
             detect_s=1.6, recover_s=14.0),
+    _daemon("suspended", "the computer sleeps for 1 h", "daemon.suspended", hook(slept_s=3600.0)),
     _daemon("config_corrupt", "the configuration is damaged at the next start", "", nothing, conduct=corrupt_config),
     _daemon("state_corrupt", "the state file is damaged at the next start", "daemon.state_file_corrupt", nothing,
             conduct=corrupt_state, short=(IDLE,)),

@@ -48,7 +48,7 @@ CONDITIONS = {
         "worker_restarted worker_hung settings_not_kept"
     ),
     "daemon": (
-        "tick_overrun loop_blocked disk_full clock_stepped state_file_corrupt recorder_failed memory_high "
+        "tick_overrun loop_blocked suspended disk_full clock_stepped state_file_corrupt recorder_failed memory_high "
         "perception_nonsense lease_lapsed"
     ),
     "stop_input": "open lost stale stuck",

@@ -22,6 +22,7 @@ from graderd.hal.fault import DeviceFault
 from graderd.runtime.app.journal import fields_of
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.control import log as control_log
+from graderd.runtime.health import SleepWatch
 from graderd.runtime.state_file import StateFile
 from harness.fakes import FakeMachine
 
@@ -197,6 +198,41 @@ async def test_after_a_freeze_the_reason_is_the_freeze(bench: Bench) -> None:
     assert bench.loop.tick.state.mode is Mode.DISARMED
     assert bench.loop.tick.state.reason.startswith("daemon.loop_blocked: ")
     assert {"daemon.loop_blocked", "rotation.no_reply"} <= {fault.name for fault in bench.loop.tick.faults}
+
+
+@pytest.mark.parametrize("at_work", ["jog", "auto", "arming"])
+async def test_after_a_sleep_of_the_computer_nothing_goes_on(bench: Bench, at_work: str) -> None:
+    """No time went by on the clock by which all goes: readings and leases from before it were taken for fresh."""
+    slept_s = 100.0
+    bench.loop.fault_sources.append(SleepWatch(lambda: slept_s).faults)
+    if at_work == "arming":
+        bench.loop._queue.append((cmd.Arm(client="a"), asyncio.get_running_loop().create_future()))
+        bench.loop.run_tick()
+        assert bench.loop.tick.state.arming_since_s is not None
+    else:
+        await bench.arm()
+        command = cmd.Jog(axis="rotate", value=20.0, client="a") if at_work == "jog" else cmd.Auto(client="a")
+        bench.loop._queue.append((command, asyncio.get_running_loop().create_future()))
+        bench.loop.run_tick()
+        assert bench.loop.tick.state.mode is (Mode.MANUAL if at_work == "jog" else Mode.AUTO)
+    slept_s += 3600.0
+    bench.machine.rotation.lose()
+    renewal: asyncio.Future[cmd.Reply] = asyncio.get_running_loop().create_future()
+    bench.loop._queue.append((cmd.Renew(client="a"), renewal))
+    bench.loop.run_tick()
+    state = bench.loop.tick.state
+    assert (state.mode, state.arming_since_s, state.lease) == (Mode.DISARMED, None, None)
+    assert state.reason.startswith("daemon.suspended: ")
+    assert bench.loop.tick.intents.goals.empty
+    assert not (await renewal).accepted
+    (fault,) = (fault for fault in bench.loop.tick.faults if fault.name == "daemon.suspended")
+    assert fault.detail == "it slept for 3600.0 s"
+    bench.machine.rotation.restore()
+    for _ in range(120):
+        bench.machine.clock.advance(0.02)
+        bench.loop.run_tick()
+        assert bench.loop.tick.state.mode is Mode.DISARMED
+    assert "daemon.suspended" not in {fault.name for fault in bench.loop.tick.faults}
 
 
 async def test_the_wires_come_before_the_log_and_the_state_file(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

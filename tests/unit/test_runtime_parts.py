@@ -22,7 +22,7 @@ from graderd.runtime import devices as devices_module
 from graderd.runtime import state_file
 from graderd.runtime.app.perception_child import AngleHistory, settings_not_kept
 from graderd.runtime.devices import Devices, open_devices
-from graderd.runtime.health import HealthWatch
+from graderd.runtime.health import HealthWatch, SleepWatch, slept_s
 from graderd.runtime.sd_notify import SystemdNotifier
 from graderd.runtime.state_file import StateFile
 from graderd.runtime.status import build_status
@@ -180,6 +180,33 @@ def test_a_stepped_clock_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert fault.condition == "clock_stepped"
     assert "+3600 s" in fault.detail
     assert watch.faults(time.monotonic() + 60.0) == ()
+
+
+def test_a_sleep_of_the_computer_is_told_once_and_is_no_step_of_its_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    asleep_s = 5.0
+    watch = SleepWatch(lambda: asleep_s)
+    assert watch.faults(1.0) == ()
+    asleep_s = 4.9  # a pause between the two readings: less than there is, never more
+    assert watch.faults(2.0) == ()
+    asleep_s = 5.0
+    assert watch.faults(3.0) == ()
+    asleep_s = 7.5
+    (fault,) = watch.faults(4.0)
+    assert (fault.name, fault.detail) == ("daemon.suspended", "it slept for 2.5 s")
+    assert len(watch.faults(4.9)) == 1
+    assert watch.faults(5.1) == ()
+    health, boot, real = HealthWatch(Config()), time.clock_gettime, time.time
+    monkeypatch.setattr(time, "clock_gettime", lambda clock: boot(clock) + 3600.0)
+    monkeypatch.setattr(time, "time", lambda: real() + 3600.0)
+    health.measure()
+    assert "clock_stepped" not in {fault.condition for fault in health.faults(time.monotonic())}
+
+
+def test_this_computer_tells_how_long_it_slept() -> None:
+    before_s = slept_s()
+    watch = SleepWatch()
+    assert all(watch.faults(number * 0.001) == () for number in range(20000)), "it slept, or the clocks differ by more"
+    assert slept_s() - before_s < 0.001
 
 
 def test_high_memory_is_told() -> None:

@@ -15,9 +15,17 @@ ROWS = (
     FaultRow(
         "daemon.loop_blocked",
         "the daemon stood still for a moment; the devices have stopped by themselves",
-        "a defect of graderd or of a library, or a computer that was suspended",
+        "a defect of graderd or of a library, or a computer that has far too much to do",
         "report it with the daemon's log; 'graderd auto' again when the area is clear",
         Reaction.RETREAT,
+    ),
+    FaultRow(
+        "daemon.suspended",
+        "the computer slept: what was measured before is older than it looks",
+        "its lid was closed, a button was pressed, or its power management put it to sleep",
+        "switch sleep off ('systemctl mask sleep.target suspend.target'); arm again when the area is clear",
+        # Not only what moved by itself: who armed the machine may have gone long ago.
+        Reaction.DISARM,
     ),
     FaultRow(
         "daemon.disk_full",

@@ -31,7 +31,7 @@ from graderd.runtime.app.services import build_services
 from graderd.runtime.app.sim import RigProcess, attach, new_rig_directory
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.devices import open_devices
-from graderd.runtime.health import HangWatch, HealthWatch
+from graderd.runtime.health import HangWatch, HealthWatch, SleepWatch
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 from graderd.runtime.port import Port
 from graderd.runtime.sd_notify import SystemdNotifier
@@ -134,7 +134,7 @@ class Daemon:
         services = build_services(config, self._devices, self._loop, self._eyes, self._recorder)
         self._port = Port(config, self._loop, self._devices, self._eyes, services, self._recorder.status)
         self._health = HealthWatch(config)
-        self._loop.fault_sources += [self._recorder.faults, self._health.faults]
+        self._loop.fault_sources += [self._recorder.faults, self._health.faults, SleepWatch().faults]
         self._stop_input = build_stop_input(config, clock, on_stop=self._stop_from_input)
         if self._stop_input is not None:
             self._loop.fault_sources.append(self._stop_input.faults)
