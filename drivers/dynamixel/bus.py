@@ -298,10 +298,15 @@ class ServoBus:
         pings = [p for p in heard if len(p.data) == _PING_DATA_BYTES]
         return [(p.packet_id, p.data[0] | p.data[1] << 8, p.data[2]) for p in pings]
 
+    @property
+    def doubled_n(self) -> int:
+        """Answers beyond the first one to a request, with the id that was asked and none owed: a second servo's."""
+        return self._counters["doubled_n"]
+
     async def answers_twice(self) -> bool:
         """Whether a request so far drew two answers; waits until the second to the last one had its time."""
         await asyncio.sleep(self._allowance.now_s)
-        return self._counters["doubled_n"] > 0
+        return self.doubled_n > 0
 
     async def read(self, servo_id: int, address: int, size: int, *, attempts_n: int = 2) -> Packet:
         """``size`` bytes from ``address``; the packet's ``data`` holds exactly that many, ``alert`` stands beside it.
@@ -542,8 +547,8 @@ class ServoBus:
         elif self._everybody is not None:
             self._everybody.append(packet)
         elif reply is None or reply.done():
-            if packet.packet_id == self._wanted_id and not self._owed and not self._counters["timeouts_n"]:
-                counters["doubled_n"] += 1  # nothing was ever given up that could be late
+            if packet.packet_id == self._wanted_id and not self._owed:
+                counters["doubled_n"] += 1  # nothing that was given up could still be late
             self._note_late(packet)
         elif packet.packet_id != self._wanted_id:
             counters["foreign_n"] += 1

@@ -114,6 +114,12 @@ class Ph54Device:
         try:
             model, firmware = await bus.ping(self.servo_id, attempts_n=6)
         except DeviceTimeoutError as e:
+            if bus.damaged_n:
+                raise DeviceTimeoutError(
+                    self.where,
+                    f"every answer at {bus.baud_n} bit/s is damaged",
+                    f"Look for a second servo with id {self.servo_id}; check shield and termination of the RS-485 line",
+                ) from e
             raise DeviceTimeoutError(
                 self.where,
                 f"nothing answers at {bus.baud_n} bit/s",

@@ -17,6 +17,7 @@ from graderd.hal.rotator import RotatorTelemetry
 from graderd.hal.settings import Ph54Settings
 
 _CORRUPT_N, _CORRUPT_WINDOW_S = 3, 1.0
+_DOUBLED_N, _DOUBLED_WINDOW_S = 3, 1.0
 _READS_MOST_N = 3
 _DOUBT_S = 0.1
 """Against a reading older than this, a new one is not wrong but only not vouched for."""
@@ -57,6 +58,8 @@ class ServoObserver:
         self._counts: int | None = None
         self._damaged_n = 0
         self._damaged_s: deque[float] = deque(maxlen=64)
+        self._doubled_n = 0
+        self._doubled_s: deque[float] = deque(maxlen=_DOUBLED_N)
 
     def restart(self, *, position_known: bool = False) -> None:
         """A servo just found or armed. ``position_known``: a jump from the last one counts."""
@@ -222,6 +225,19 @@ class ServoObserver:
         detail = f"{recent_n} damaged or impossible replies within {_CORRUPT_WINDOW_S:g} s"
         self.faults.keep("corrupt_replies", recent_n >= _CORRUPT_N, detail, now_s)
 
+    def count_doubles(self, bus: ServoBus) -> None:
+        """Several requests within a second that drew two whole answers: a second servo has the same id, and moves too.
+
+        It is found so only where its answers come one after the other. Where they lie on each other, those that differ
+        are damaged, which a disturbed line does as well, and equal ones cannot be told from one.
+        """
+        now_s, doubled_n = self._clock.now_s(), bus.doubled_n
+        self._doubled_s.extend([now_s] * min(max(0, doubled_n - self._doubled_n), _DOUBLED_N))
+        self._doubled_n = doubled_n
+        recent_n = sum(1 for at_s in self._doubled_s if now_s - at_s <= _DOUBLED_WINDOW_S)
+        detail = f"two servos answer to id {self._settings.servo_id_n}: give one of them another id"
+        self.faults.keep("wrong_device", recent_n >= _DOUBLED_N, detail, now_s)
+
     def damaged_lately(self) -> bool:
         """Whether a lost connection was damaged replies rather than silence."""
         return bool(self._damaged_s) and self._clock.now_s() - self._damaged_s[-1] < 2 * _CORRUPT_WINDOW_S
@@ -230,3 +246,5 @@ class ServoObserver:
         """The damage of another connection does not count."""
         self._damaged_n = self.implausible_n
         self._damaged_s.clear()
+        self._doubled_n = 0
+        self._doubled_s.clear()

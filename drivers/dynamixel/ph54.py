@@ -16,7 +16,7 @@ from dataclasses import replace
 from graderd.drivers.dynamixel import arming
 from graderd.drivers.dynamixel.bus import BusTap
 from graderd.drivers.dynamixel.calibration import Calibration
-from graderd.drivers.dynamixel.connection import Found, ServoLink, condition_of
+from graderd.drivers.dynamixel.connection import Found, ServoLink
 from graderd.drivers.dynamixel.device import EXTENDED_MODE, POSITION_MODE, Difference
 from graderd.drivers.dynamixel.observer import ServoObserver
 from graderd.drivers.dynamixel.serial_port import ListPorts, system_ports
@@ -118,9 +118,9 @@ class Ph54Rotator:
             async with self._task.wire_lock:
                 await self._task.connect()
         except BaseException as e:
-            self._link.disconnect()
             if isinstance(e, DeviceError):
-                self._observer.faults.set(condition_of(e), e.cause, self._clock.now_s())
+                self._observer.faults.set(self._task.condition_of(e), e.cause, self._clock.now_s())
+            self._link.disconnect()
             raise
         self._task.note(Event.OPENED)
         self._task.start()
@@ -132,6 +132,9 @@ class Ph54Rotator:
             raise DeviceRefusedError(
                 DEVICE, "whole turns were lost, the angle is ambiguous", "Check the blade, then confirm the turns"
             )
+        if "wrong_device" in self._observer.faults.names(self._clock.now_s()):
+            cause = f"two servos answer to id {self.settings.servo_id_n}"
+            raise DeviceRefusedError(DEVICE, cause, "Give one of them another id")
         async with self._task.wire_lock:
             self._require(Lifecycle.STANDBY)
             device = self._link.device
@@ -203,7 +206,7 @@ class Ph54Rotator:
                 await self._link.reboot()
                 await self._task.first_readings(self._link.device)
             except DeviceError as e:
-                self._observer.faults.set(condition_of(e), e.cause, self._clock.now_s())
+                self._observer.faults.set(self._task.condition_of(e), e.cause, self._clock.now_s())
                 if self._link.bus is not None:
                     self._link.bus.close()  # the servo task finds the line closed and starts anew
                 raise

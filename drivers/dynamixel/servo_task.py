@@ -419,10 +419,17 @@ class ServoTask:
             await asyncio.sleep(pause_s)
             pause_s = min(_RECONNECT_MOST_S, 2 * pause_s)
 
-    def _fail(self, error: DeviceError) -> None:
-        condition, faults = condition_of(error), self._observer.faults
+    def condition_of(self, error: DeviceError) -> str:
+        """The fault's name for an error that ended or prevented a connection, while its bus is still there."""
+        condition = condition_of(error)
+        if self._link.bus is not None:
+            self._observer.count_damage(self._link.bus)
         if condition == "no_reply" and self._observer.damaged_lately():
-            condition = "corrupt_replies"
+            return "corrupt_replies"
+        return condition
+
+    def _fail(self, error: DeviceError) -> None:
+        condition, faults = self.condition_of(error), self._observer.faults
         faults.set(condition, error.cause, self._clock.now_s())
         # At every attempt: the log repeats it ever more rarely.
         log.warning("%s: %s", condition, error, extra={**FIELDS, "fault": f"{DEVICE}.{condition}"})
@@ -486,6 +493,7 @@ class ServoTask:
         await self._tolerant(self._protect(device))
         if self._link.bus is not None:
             observer.count_damage(self._link.bus)
+            observer.count_doubles(self._link.bus)
             self._link.judge_loss()
 
     async def _leave_witness(self, device: Ph54Device) -> None:

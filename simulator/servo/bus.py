@@ -25,6 +25,8 @@ _TICK_S = 0.01
 _SPIN_S = 0.001
 """With wire time, the last part of a wait is spun: a sleeping process wakes too late by up to that much."""
 _RETURN_DELAY_STEP_S = 2e-6
+_PLAIN_REPLY_BYTES = 14
+"""A ping's answer; it and shorter ones are the same from two servos of a kind."""
 _STALL_S = 0.03
 """A pass of the loop that comes so late is our own stall, not the client's silence: no watchdog counts it."""
 
@@ -313,6 +315,10 @@ class VirtualServoBus:
             reply = reply[: self._random.randrange(1, len(reply))]
         if "babble" in self._faults:
             reply = reply[:5] + int(self._faults["babble"]["length"]).to_bytes(2, "little") + reply
+        if "collide" in self._faults and len(reply) > _PLAIN_REPLY_BYTES:
+            # Neither wins the line: a bit that one of them pulls low is low.
+            other = reply[:9] + self._random.randbytes(len(reply) - 9)
+            reply = bytes(one & two for one, two in zip(reply, other, strict=True))
         if "twin" in self._faults:
             reply += reply
         if "noise" in self._faults:

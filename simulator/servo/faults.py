@@ -50,7 +50,8 @@ FAULTS: dict[str, FaultKind] = {
     "foreign_id": FaultKind("status packets carry another servo's id", {"servo_id": 99}),
     "noise": FaultKind("stray bytes before status packets", {"bytes_n": 7}),
     "babble": FaultKind("before status packets a header that claims so long a packet", {"length": 1000}),
-    "twin": FaultKind("a second servo with the same id answers too"),
+    "twin": FaultKind("a second servo with the same id answers after the first one"),
+    "collide": FaultKind("a second servo with the same id answers at the same time: what differs is damaged"),
     "trickle": FaultKind("bytes come and go one at a time", {"gap_s": 0.0003}),
     "unplug": FaultKind("the cable is pulled: port and link vanish"),
     # in the servo

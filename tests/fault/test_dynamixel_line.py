@@ -10,7 +10,7 @@ import pytest
 
 from graderd.drivers.dynamixel.bus import ServoBus
 from graderd.hal.device import Lifecycle
-from graderd.hal.errors import DeviceTimeoutError, LifecycleError, WrongDeviceError
+from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError, LifecycleError, WrongDeviceError
 from tests.contract.conformance import all_known, state
 from tests.dynamixel_sim import Bench, bench
 
@@ -97,6 +97,51 @@ async def test_two_servos_with_one_id_are_told_as_such(tmp_path: Path) -> None:
         with pytest.raises(WrongDeviceError, match="two servos answer to id 1"):
             await rig.rotator.open()
         assert "wrong_device" in rig.conditions()
+
+
+async def test_a_second_servo_with_the_id_is_told_at_work_and_nothing_arms_on_it(rig: Bench) -> None:
+    await rig.rotator.arm()
+    rig.bus.inject("drop", rate=0.15)  # answers that came late or never before are no second servo's
+    await rig.until(lambda: rig.rotator.telemetry().counters["timeouts_n"] > 5)
+    rig.bus.clear_faults()
+    await rig.until(lambda: not rig.conditions())
+    rig.bus.inject("twin")
+    await rig.until(lambda: "wrong_device" in rig.conditions())
+    assert [f.detail for f in rig.rotator.faults() if f.condition == "wrong_device"] == [
+        "two servos answer to id 1: give one of them another id"
+    ]
+    await rig.rotator.disarm()
+    with pytest.raises(DeviceRefusedError, match="two servos answer to id 1"):
+        await rig.rotator.arm()
+    rig.bus.clear_faults()
+    await rig.until(lambda: not rig.conditions())
+    await rig.rotator.arm()
+
+
+async def test_late_answers_are_no_second_servo(rig: Bench) -> None:
+    told = set[str]()
+    for delay_s in (0.0, 0.08, 0.0, 0.03, 0.0):
+        rig.bus.inject("delay", seconds=delay_s)
+        for _ in range(10):
+            await rig.rotator.wait_telemetry()
+            told |= rig.conditions()
+    assert "wrong_device" not in told
+
+
+async def test_answers_that_lie_on_each_other_are_told_as_damage_not_as_silence(tmp_path: Path) -> None:
+    async with bench(tmp_path, opened=False) as rig:
+        rig.bus.inject("collide")
+        with pytest.raises(DeviceTimeoutError):
+            await rig.rotator.open()
+        assert rig.conditions() == {"corrupt_replies"}
+        rig.bus.clear_faults()
+        rig.bus.inject("flip")
+        with pytest.raises(DeviceTimeoutError, match=r"every answer at 57600 bit/s is damaged.*second servo with id 1"):
+            await rig.rotator.open()
+        rig.bus.clear_faults()
+        await rig.rotator.open()
+        rig.bus.inject("collide")
+        await rig.until(lambda: "corrupt_replies" in rig.conditions())
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.005, 0.02, 0.05])
