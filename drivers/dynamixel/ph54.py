@@ -181,10 +181,14 @@ class Ph54Rotator:
             return
         was = self._task.lifecycle
         self._task.note(Event.CLOSED)
-        if was is not Lifecycle.FAILED and self._task.torque_is_ours and self._observer.torque_on:
+        if was is not Lifecycle.FAILED and self._task.torque_is_ours:
             try:
                 async with asyncio.timeout(_CLOSE_S):
-                    await self._task.power_down(off=self.settings.torque_at_exit == "off", leaving=True)
+                    if self._observer.torque_on:
+                        await self._task.power_down(off=self.settings.torque_at_exit == "off", leaving=True)
+                    else:  # an arming under way sees that it is closed, and switches torque off again
+                        async with self._task.wire_lock:
+                            pass
             except (DeviceError, TimeoutError) as e:
                 log.error("%s: could not be made safe at exit (%s); its bus watchdog stops it", DEVICE, e, extra=FIELDS)
         await self._task.stop()

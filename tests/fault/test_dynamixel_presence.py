@@ -230,6 +230,15 @@ async def test_arming_that_is_broken_off_leaves_no_torque(rig: Bench, what: str,
     await works_again(rig, 3.0)
 
 
+async def test_closing_an_arming_that_has_just_switched_torque_on_switches_it_off(rig: Bench) -> None:
+    arming = asyncio.create_task(rig.rotator.arm())
+    await rig.until(lambda: rig.servo.torque_enabled)
+    await rig.rotator.close()
+    assert not rig.servo.torque_enabled
+    with pytest.raises(LifecycleError, match="while it was being armed"):
+        await arming
+
+
 async def test_arming_is_refused_outside_the_limits_and_in_motion(rig: Bench) -> None:
     rig.servo.shaft_deg = 80.0
     await rig.rotator.wait_telemetry()
