@@ -211,7 +211,7 @@ class HealthMonitor:
 
         The camera was moved where blade and ground moved together, or where the blade's axis, which cannot move, did. A
         ground that tilts under a blade in its place is a slope; a blade that is turned about its axis, or higher than
-        its lifts say over ground in its place, is a blade that moved.
+        its lifts say over ground in its place, or on another slope, is a blade that moved.
         """
         settings, fix, ground = self._settings, soil.blade, soil.ground
         axis_m = math.hypot(fix.ahead_m, fix.along_m)
@@ -240,6 +240,13 @@ class HealthMonitor:
                 moved.append(f"{said}, and the ground with it (tilted by {ground.slope_deg():.1f} deg)")
             elif stance.attitude.height_mm is not None and abs(up_m) > settings.knocked_mm / 1000:
                 elsewhere.append(said)
+            elif stance.attitude.slope_deg is not None:
+                # Lifts with their sides swapped tell the slope with the wrong sign. A camera that rolled a little tilts
+                # the ground as well, so the edge has to be off against that, too.
+                turn = math.radians(stance.angle_deg)
+                floor_deg = math.degrees(ground.slope_y * math.cos(turn) - ground.slope_x * math.sin(turn))
+                if min(abs(tilted_deg), abs(tilted_deg - floor_deg)) > settings.knocked_ground_deg:
+                    elsewhere.append(f"{said} (are the lifts' sides swapped?)")
         if moved:
             return [PictureFault("knocked", ", ".join(moved) + " against the calibration")]
         if elsewhere:

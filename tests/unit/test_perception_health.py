@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import SoilObservation, Zone
 from graderd.hal.camera import Frame
@@ -226,6 +227,31 @@ def test_soil_heaped_against_the_face_is_not_taken_for_the_face() -> None:
     assert observation.volume_left_l == pytest.approx(left_l, rel=0.15)
     # What is cut and a layer of soil look the same: where no lift tells which, nobody knows.
     assert classifier.classify(frame, angle_deg, 0.01).zone is Zone.UNKNOWN
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 45.0])
+@pytest.mark.parametrize("slope_deg", [-4.0, -2.0, 2.0, 4.0])
+def test_lifts_whose_sides_are_swapped_are_found_by_the_slope_of_the_edge(slope_deg: float, angle_deg: float) -> None:
+    """The lifts said +2 degrees of a blade at -2, and nothing contradicted them."""
+    world, pose = World(), BladePose(angle_deg=angle_deg, slope_deg=slope_deg, height_m=0.04)
+    world.lay(scene_heights(SceneZone.EVEN, world.vehicle.x_m, BladePose(), 1))
+    world.vehicle.drive(0.6, 1.2)
+    for _ in range(150):
+        world.step(0.01, pose)
+    renderer = Renderer((640, 400), (424, 240), seed=3)
+    seen = SceneState(world.field.heights_m.astype(np.float32), world.field.cell_m, world.vehicle.x_m, pose)
+    color, depth = renderer.render(seen, Appearance())
+    frame = Frame(color, depth, renderer.color_intrinsics, renderer.depth_intrinsics, 0.0)
+    classifier = make_classifier(PerceptionSettings(), CameraCalibration(), BladeGeometry(), live=False)
+
+    def told(slope_deg: float | None) -> SoilObservation:
+        return classifier.classify(frame, angle_deg, 0.01, MeasuredAttitude(40.0, slope_deg, 0.0))
+
+    assert named(told(slope_deg)) == []
+    assert named(told(None)) == []
+    swapped = told(-slope_deg)
+    assert named(swapped) == ["blade_elsewhere"]
+    assert "sides swapped" in swapped.faults[0].detail
 
 
 def test_an_old_blade_angle_is_unknown_without_a_fault_of_the_picture() -> None:
