@@ -11,7 +11,7 @@ import pytest
 from graderd.client import Client
 from graderd.core.status import Status
 from hil import bench
-from tests.machine import machine
+from tests.machine import PATIENT, machine
 
 pytestmark = [pytest.mark.whole_machine, pytest.mark.xdist_group("beside a machine"), pytest.mark.timeout(240)]
 
@@ -34,7 +34,7 @@ async def test_every_motion_is_asked_for_and_measured(tmp_path: Path, monkeypatc
         asked.append(question)
         return "yes"
 
-    async with machine(tmp_path) as whole:
+    async with machine(tmp_path, PATIENT) as whole:
         await whole.until(at_rest)
         client = Client(tmp_path / "graderd.sock")
         session = bench.Bench(client, yes)
@@ -70,7 +70,7 @@ async def test_every_motion_is_asked_for_and_measured(tmp_path: Path, monkeypatc
 
 
 async def test_nothing_moves_where_the_person_does_not_say_yes(tmp_path: Path) -> None:
-    async with machine(tmp_path) as whole:
+    async with machine(tmp_path, PATIENT) as whole:
         before = await whole.until(at_rest)
         session = bench.Bench(Client(tmp_path / "graderd.sock"), lambda _: "y")
         await asyncio.to_thread(session.run)
