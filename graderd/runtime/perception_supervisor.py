@@ -189,8 +189,13 @@ class PerceptionSupervisor:
         if preview is None or preview.done():
             preview = self._previews[wanted] = asyncio.get_running_loop().create_future()
             self._write(PreviewRequest(format=wanted))
-        async with asyncio.timeout(timeout_s):
-            return await asyncio.shield(preview)
+        try:
+            async with asyncio.timeout(timeout_s):
+                return await asyncio.shield(preview)
+        except TimeoutError:
+            if self._previews.get(wanted) is preview:
+                del self._previews[wanted]  # who asks again is not answered by what never came
+            raise
 
     async def save_frame(self, folder: Path, id_: str, blade_angle_deg: float, timeout_s: float = 5.0) -> None:
         """Have the next frame added to the frame set in ``folder``.
@@ -321,6 +326,8 @@ class PerceptionSupervisor:
             log.info("camera open: %s", message.description, extra=_FIELDS)
             if self._frames.path:
                 self._write(RecordFrames(wanted=self._frames))
+            for wanted in self._previews:  # the one that was asked may be gone
+                self._write(PreviewRequest(format=wanted))
         elif isinstance(message, CameraProblem):
             log.warning("camera: %s", message.message, extra={**_FIELDS, "fault": f"camera.{message.condition}"})
             self._problem = message

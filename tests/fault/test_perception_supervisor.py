@@ -103,6 +103,36 @@ async def test_a_frame_that_has_grown_old_decides_nothing(tmp_path: Path) -> Non
         assert "old by now" in taken.reason
 
 
+async def test_a_picture_that_a_dead_child_was_asked_for_comes_from_the_next(tmp_path: Path) -> None:
+    """Else nobody would see that picture again: all who ask for the same wait for the same."""
+    body = (
+        "opened()\nframe()\n"
+        "request = next(r for r in map(json.loads, sys.stdin) if r['kind'] == 'preview')\n"
+        "if starts == 1:\n    sys.exit(1)\n"
+        "say(kind='preview', format=request['format'], capture_s=time.monotonic(), jpeg_base64='aGk=')\n"
+        "while True:\n    frame(); time.sleep(0.03)\n"
+    )
+    async with worker(tmp_path, body) as eyes:
+        await until(lambda: eyes.newest is not None)
+        assert (await eyes.preview_jpeg(timeout_s=DEADLINE_S)).value == b"hi"
+    assert len(starts(tmp_path)) == 2
+
+
+async def test_a_picture_that_never_came_is_asked_for_anew(tmp_path: Path) -> None:
+    body = (
+        "opened()\nframe()\n"
+        "requests = (r for r in map(json.loads, sys.stdin) if r['kind'] == 'preview')\n"
+        "next(requests)\n"
+        "say(kind='preview', format=next(requests)['format'], capture_s=time.monotonic(), jpeg_base64='aGk=')\n"
+        "time.sleep(600)\n"
+    )
+    async with worker(tmp_path, body, CAMERA.model_copy(update={"stale_s": 60.0, "restart_s": 120.0})) as eyes:
+        await until(lambda: eyes.newest is not None)
+        with pytest.raises(TimeoutError):
+            await eyes.preview_jpeg(timeout_s=0.05)
+        assert (await eyes.preview_jpeg(timeout_s=DEADLINE_S)).value == b"hi"
+
+
 async def test_a_picture_counts_once_and_not_after_a_newer_one(tmp_path: Path) -> None:
     """What waited in a child, or is sent again by it, is no further vote for what was seen."""
     body = (
