@@ -5,7 +5,7 @@ const RENEW_MS = 100;
 const UNSENT_MS = 200;
 
 export class Hold {
-  /** `link`: tells whether the daemon is heard. `say(key or text)`: what became of it. */
+  /** `link`: tells whether the daemon is heard. `say(...keys or texts)`: what became of it. */
   constructor(link, say) {
     this.link = link;
     this.say = say;
@@ -98,17 +98,17 @@ export class Hold {
     if (!held) return;
     held.waits = Math.max(0, held.waits - 1);
     if (reply.accepted) return;
-    this.end((reply.where || reply.command) === "renew" ? "lapsed" : `${reply.error || reply.message}. ${reply.remedy || ""}`);
+    this.end(...((reply.where || reply.command) === "renew" ? ["lapsed"] : [reply.error || reply.message, reply.remedy]));
   }
 
   /** Let go: said to the daemon at once; what cannot be said ends by its lease. */
-  end(why) {
+  end(...why) {
     const held = this.held;
     if (!held) return;
     this.held = null;
     clearInterval(this.timer);
     delete held.button.dataset.held;
     this.send({ command: "release" });
-    if (why) this.say(why);
+    this.say(...why);
   }
 }

@@ -4,7 +4,7 @@ import { Link, ask } from "./link.js";
 import { Picture } from "./picture.js";
 import { reach } from "./reach.js";
 import { THIRDS, color, front, plan, plot, profile } from "./draw.js";
-import { current, speak, t } from "./texts.js";
+import { current, learn, speak, t, theirs } from "./texts.js";
 
 const SPAN_MS = 600_000, SAMPLE_MS = 250;
 const JOGS = [["rotate", "°"], ["height", "mm"], ["slope", "°"], ["pitch", "°"]];
@@ -23,29 +23,32 @@ function number(value, unit, digits = 1) {
   return `${Number(text) === 0 ? text.replace("-", "") : text.replace("-", "−")}${unit === "°" ? "" : " "}${unit}`.trim();
 }
 
-/** Text into everything marked with that name; only what changed is touched. `theirs`: the daemon's words, English. */
-function put(name, text, theirs = false) {
-  if (shown[name] === text) return;
-  shown[name] = text;
-  for (const element of document.querySelectorAll(`[data-v=${name}]`)) {
-    element.textContent = text;
-    if (theirs) element.lang = "en";
-  }
+/** `text` into `element`, marked as English where it is not in the page's language. */
+function write(element, text) {
+  element.textContent = text;
+  if (current() === "en" || !/[a-z]{2}/.test(text) || /[가-힣]/.test(text)) element.removeAttribute("lang");
+  else element.lang = "en";
+  return element;
 }
 
-function list(id, items, empty) {
-  const key = JSON.stringify(items) + current();
+/** Text into everything marked with that name; only what changed is touched. */
+function put(name, text) {
+  if (shown[name] === text) return;
+  shown[name] = text;
+  for (const element of document.querySelectorAll(`[data-v=${name}]`)) write(element, text);
+}
+
+function list(id, items) {
+  const key = JSON.stringify(items);
   if (shown[id] === key) return;
   shown[id] = key;
-  $(id).replaceChildren(...(items.length ? items : [{ good: true, head: empty }]).map(({ good, mild, head, more = [], theirs }) => {
+  $(id).replaceChildren(...items.map(({ good, mild, head, more }) => {
     const item = document.createElement("li"), mark = document.createElement("i"), body = document.createElement("div"), name = document.createElement("b");
     item.className = good ? "good" : mild ? "mild" : "bad";
     mark.textContent = good ? "✓" : mild ? "○" : "✕";
     mark.setAttribute("aria-label", good ? t("met") : t("unmet"));
     mark.setAttribute("role", "img");
-    name.textContent = head;
-    if (theirs) body.lang = "en";
-    body.append(name, ...more.filter(Boolean).map((text) => Object.assign(document.createElement("small"), { textContent: text })));
+    body.append(write(name, head), ...more.filter(Boolean).map((text) => write(document.createElement("small"), text)));
     item.append(mark, body);
     return item;
   }));
@@ -57,35 +60,36 @@ function show(next) {
   status = next;
   const rotation = next.axes.rotation ?? { requested: null, limited: null, measured: null, limited_because: "" };
   put("mode", `${next.arming ? t("arming") : t(`m_${next.mode}`)}${next.simulated ? ` · ${t("simulated")}` : ""}`);
-  put("reason", next.reason, true);
+  put("reason", theirs(next.reason));
   for (const third of THIRDS) {
     put(`ahead_${third}`, number((next.soil.ahead ?? {})[`${third}_l`] ?? next.soil[`volume_${third}_l`], ""));
     put(`carried_${third}`, number((next.soil.carried ?? {})[`${third}_l`], ""));
   }
   put("zone", t(`z_${next.soil.zone}`));
-  put("soil_reason", next.soil.reason, true);
+  put("soil_reason", theirs(next.soil.reason));
   put("decision", next.decision.zone === null ? t("none_yet") : `${t(`z_${next.decision.zone}`)} → ${number(next.decision.angle_deg, "°")}`);
-  put("decision_reason", next.decision.reason, true);
-  if ($("holding").textContent !== next.holding.join("; ")) $("holding").textContent = next.holding.join("; ");
+  put("decision_reason", theirs(next.decision.reason));
+  put("holding", next.holding.map(theirs).join("; "));
   put("requested", number(rotation.requested, "°"));
   put("limited", number(rotation.limited, "°"));
   put("measured", number(rotation.measured, "°"));
-  put("limited_because", rotation.limited_because, true);
+  put("limited_because", theirs(rotation.limited_because));
   put("height", number(next.attitude.height_mm, "mm", 0));
   put("slope", number(next.attitude.slope_deg, "°"));
   put("pitch", number(next.attitude.pitch_deg, "°"));
   put("lease", next.lease ? t("for_more", next.lease.client, next.lease.remaining_s.toFixed(1)) : t("nobody"));
-  put("camera", `${next.camera.lifecycle} ${next.camera.description}`, true);
+  put("camera", `${theirs(next.camera.lifecycle)} ${next.camera.description}`);
   put("tick", `${next.tick.rate_hz.toFixed(0)} Hz, p99 ${next.tick.lateness_p99_ms.toFixed(1)} ms`);
   put("vehicle", next.vehicle.speed_m_per_s === null ? t("unknown_speed") : number(next.vehicle.speed_m_per_s, "m/s", 2));
-  put("last_stop", next.last_stop || t("none"), true);
+  put("last_stop", next.last_stop ? theirs(next.last_stop) : t("none"));
   put("version", next.version);
   const faults = next.faults;
   $("faults-n").textContent = faults.length || "";
-  list("faults", faults.map((f) => ({ mild: f.reaction === "warn", head: f.reads, theirs: true, more: [f.remedy, f.detail, `${f.name}: ${f.reaction}, clears ${f.clears}`] })), t("no_faults"));
-  list("readiness", next.readiness.map((r) => ({ good: r.met, mild: !r.mandatory, head: r.name, theirs: true, more: r.met ? [] : [r.reason, r.remedy, r.mandatory ? "" : t("may_be")] })), "");
-  const worst = faults.find((f) => f.reaction !== "warn"), alarm = worst ? `${worst.reads}. ${worst.remedy}` : "";
-  if ($("alarm").textContent !== alarm) { $("alarm").textContent = alarm; $("alarm").lang = "en"; }
+  const told = faults.map((f) => ({ mild: f.reaction === "warn", head: theirs(f.reads), more: [theirs(f.remedy), theirs(f.detail), `${f.name}: ${theirs(f.reaction)}, ${t("clears", theirs(f.clears))}`] }));
+  list("faults", told.length ? told : [{ good: true, head: t("no_faults"), more: [] }]);
+  list("readiness", next.readiness.map((r) => ({ good: r.met, mild: !r.mandatory, head: theirs(r.name), more: r.met ? [] : [theirs(r.reason), theirs(r.remedy), r.mandatory ? "" : t("may_be")] })));
+  const worst = faults.find((f) => f.reaction !== "warn"), alarm = worst ? `${theirs(worst.reads)}. ${theirs(worst.remedy)}` : "";
+  if ($("alarm").textContent !== alarm) write($("alarm"), alarm);
   controls();
   jogValues(next, rotation);
   remember(next, rotation);
@@ -131,7 +135,9 @@ function blank() {
   for (const element of document.querySelectorAll("[data-v]")) if (element.dataset.v !== "version") element.textContent = "–";
   for (const name of Object.keys(shown)) delete shown[name];
   for (const output of document.querySelectorAll("#jogs output")) output.textContent = "–";
-  $("holding").textContent = $("alarm").textContent = "";
+  $("alarm").textContent = $("faults-n").textContent = "";
+  $("faults").replaceChildren();
+  $("readiness").replaceChildren();
   plan(null);
   front({ height_mm: null, slope_deg: null, pitch_deg: null });
   profile({});
@@ -149,7 +155,8 @@ function age(age_ms, stale) {
 
 // ---- commands ---------------------------------------------------------------------------------------------------------
 
-function say(what) { $("said").textContent = what ? t(what) : ""; }
+/** What became of a command: words of the page by their keys, and the daemon's. */
+function say(...what) { write($("said"), what.filter(Boolean).map((words) => theirs(t(words))).join(". ")); }
 
 function controls() {
   const may = right === "command" && status !== null;
@@ -169,7 +176,7 @@ for (const button of document.querySelectorAll("[data-command]")) {
     const command = button.dataset.command;
     // A reset clears the stop that was read, and none that came since.
     const answer = await ask("POST", "/v1/commands", { command, client: "page", ...(command === "reset" ? { stop_n: status.stop_n } : {}) });
-    say(answer.ok ? answer.message : `${answer.error}. ${answer.remedy}`);
+    say(...(answer.ok ? [answer.message] : [answer.error, answer.remedy]));
   });
 }
 
@@ -242,9 +249,14 @@ $("tabs").addEventListener("keydown", (event) => {
 function tongue(language) {
   speak(language);
   kept.set("language", current());
-  for (const name of Object.keys(shown)) delete shown[name];
   makeJogs();
+  retell();
+  learn(retell);
   $("who").textContent = right === null ? "" : t(right === "command" ? "may_command" : "read_only");
+}
+/** The same again, in other words. */
+function retell() {
+  for (const name of Object.keys(shown)) delete shown[name];
   if (status) show(status);
 }
 $("language").addEventListener("click", () => { hold.end("released"); tongue(current() === "en" ? "ko" : "en"); });

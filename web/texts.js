@@ -1,4 +1,7 @@
-// The page's own words. What the daemon says (reasons, faults, remedies) comes from it, in English, and is marked so.
+// The page's own words, and the daemon's (reasons, faults, remedies) in the page's language.
+import { ask } from "./link.js";
+import { Words } from "./words.js";
+
 const TEXTS = {
   en: {
     connecting: "connecting …", heard: "last heard {} s ago", live: "live", never: "nothing heard yet",
@@ -13,7 +16,7 @@ const TEXTS = {
     lease: "Moving it now:", nobody: "nobody", for_more: "{} for {} s more",
     jog: "Move by hand", jog_how: "It moves while you hold. Let go, and it holds.", needs_manual: "in manual mode alone",
     rotate: "turn", "rotate+": "↺ left", "rotate-": "right ↻", "height+": "▲ up", "height-": "▼ down", "slope+": "left end up", "slope-": "right end up", "pitch+": "top forward", "pitch-": "top back", pitch: "tilt",
-    presets: "Poses: hold until it is there", faults: "Faults", no_faults: "no faults", readiness: "Ready to arm?", met: "met", unmet: "unmet", may_be: "not needed to arm",
+    presets: "Poses: hold until it is there", faults: "Faults", no_faults: "no faults", clears: "clears {}", readiness: "Ready to arm?", met: "met", unmet: "unmet", may_be: "not needed to arm",
     machine: "Machine", camera: "camera", tick: "control", vehicle: "drives", last_stop: "last stop", version: "version", simulated: "SIMULATED", none: "none", unknown_speed: "not told",
     plots_h: "The last ten minutes", plot_angle: "Angle: requested (thin) and measured, °", plot_soil: "Soil ahead (left, center, right), litres", plot_height: "Height, mm",
     arrived: "there", released: "holding", lost: "the connection was lost: it holds", lapsed: "it holds: press again", jogging: "moving",
@@ -35,7 +38,7 @@ const TEXTS = {
     lease: "지금 조작하는 곳:", nobody: "없음", for_more: "{}, {} 초 남음",
     jog: "손으로 조작", jog_how: "누르는 동안 움직입니다. 손을 떼면 멈춥니다.", needs_manual: "수동 모드에서만",
     rotate: "회전", "rotate+": "↺ 왼쪽", "rotate-": "오른쪽 ↻", "height+": "▲ 올림", "height-": "▼ 내림", "slope+": "왼쪽 올림", "slope-": "오른쪽 올림", "pitch+": "앞으로", "pitch-": "뒤로", pitch: "기울기",
-    presets: "자세: 도달할 때까지 누르십시오", faults: "고장", no_faults: "고장 없음", readiness: "작동 준비 점검", met: "충족", unmet: "미충족", may_be: "없어도 작동 준비 가능",
+    presets: "자세: 도달할 때까지 누르십시오", faults: "고장", no_faults: "고장 없음", clears: "해제: {}", readiness: "작동 준비 점검", met: "충족", unmet: "미충족", may_be: "없어도 작동 준비 가능",
     machine: "기계", camera: "카메라", tick: "제어", vehicle: "주행", last_stop: "마지막 정지", version: "버전", simulated: "모의 실험", none: "없음", unknown_speed: "알 수 없음",
     plots_h: "최근 10분", plot_angle: "각도: 요청(가는 선), 측정, °", plot_soil: "전방의 흙 (왼쪽, 가운데, 오른쪽), 리터", plot_height: "높이, mm",
     arrived: "도달", released: "정지 유지", lost: "연결 끊김: 정지 유지", lapsed: "정지 유지: 다시 누르십시오", jogging: "움직이는 중",
@@ -47,9 +50,24 @@ const TEXTS = {
 };
 
 let language = "en";
+const daemons = {};
+const CATALOGUES = { ko: "/page/korean.json" };
+const RETRY_MS = 3000;
 
 export const t = (key, ...parts) => parts.reduce((text, part) => text.replace("{}", part), TEXTS[language][key] ?? key);
 export const current = () => language;
+/** What the daemon said, in the page's language as far as that is known; else in its English. */
+export const theirs = (text) => daemons[language]?.in(text) ?? text;
+
+/** Have the daemon's words in the page's language; `learnt()` once they are there. */
+export async function learn(learnt) {
+  const wanted = language;
+  if (!CATALOGUES[wanted] || daemons[wanted]) return;
+  const { ok, status, ...catalogue } = await ask("GET", CATALOGUES[wanted]);
+  if (!ok) return setTimeout(() => learn(learnt), RETRY_MS);
+  daemons[wanted] = new Words(catalogue);
+  learnt();
+}
 
 export function speak(wanted) {
   language = TEXTS[wanted] ? wanted : "en";

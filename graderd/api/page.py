@@ -9,7 +9,7 @@ from importlib.resources import files
 
 from fastapi import APIRouter, Response
 
-KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
+KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json"}
 INLINE = re.compile(r"<(script|style)>(.*?)</\1>", re.DOTALL)
 
 

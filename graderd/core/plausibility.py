@@ -272,7 +272,7 @@ class _AxisWatch:
         rest, allowed = self._rest, figures.tolerance
         if rest is None:
             rest, allowed = self._held_from, figures.overrun + figures.tolerance
-        if self._displaced(s, rest, allowed, "without a command"):
+        if self._displaced(s, rest, allowed, " without a command"):
             self._rest = s.position  # told again when it goes on, and over when it does not
         elif self._rest is None and s.time_s - self._held_since_s >= self._settle_s:
             self._rest = s.position
@@ -281,7 +281,7 @@ class _AxisWatch:
         moved = s.position - rest
         if abs(moved) <= allowed:
             return False
-        self._faults.tell(self._uncommanded, f"moved {moved:+.1f}{self._unit} {how}{_at(s)}", s.time_s)
+        self._faults.tell(self._uncommanded, f"moved {moved:+.1f}{self._unit}{how}{_at(s)}", s.time_s)
         return True
 
     def _driven(self, s: AxisSample, goal: float, too_fast: bool) -> None:
@@ -292,7 +292,7 @@ class _AxisWatch:
             if self._rest is None and s.time_s - self._goal_since_s >= self._move_s + _SETTLE_S:
                 self._rest = s.position
             return
-        if self._rest is not None and self._displaced(s, self._rest, self._figures.tolerance, "away from its goal"):
+        if self._rest is not None and self._displaced(s, self._rest, self._figures.tolerance, " away from its goal"):
             self._rest = None
         self._set_direction(s, goal)
         self._away(s, error, too_fast)

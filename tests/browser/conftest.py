@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright, expect
 
 from graderd.client import Client
 from graderd.simulator.control_client import RigControl
@@ -27,6 +27,7 @@ from graderd.tokens import Right, create_token
 from tests.rig_process import running_rig
 
 WAIT_S = 30.0
+expect.set_options(timeout=WAIT_S * 1000)
 SHOTS = Path(__file__).parents[2] / "var" / "web"
 CONFIG = """
 [api]

@@ -15,7 +15,9 @@ from graderd.api.settings import TcpSettings
 from harness.api_daemon import free_port, serving
 
 WEB = Path(str(files("graderd.web")))
-TEXTS = {path.name: path.read_text("utf-8") for path in WEB.iterdir() if path.suffix in (".html", ".css", ".js")}
+TEXTS = {
+    path.name: path.read_text("utf-8") for path in WEB.iterdir() if path.suffix in (".html", ".css", ".js", ".json")
+}
 
 
 @pytest.mark.live
@@ -31,7 +33,7 @@ async def test_it_is_served_without_a_token_and_to_no_foreign_name(tmp_path: Pat
             answer = await client.get(path)
             assert answer.status_code == 200, path
             assert answer.text == TEXTS[path.removeprefix("/page/")]
-            assert answer.headers["content-type"].startswith(("text/css", "text/javascript"))
+            assert answer.headers["content-type"].startswith(("text/css", "text/javascript", "application/json"))
         assert (await client.head("/")).status_code == 200
         assert (await client.get("/", headers={"Host": "evil.example"})).status_code == 403
         assert (await client.post("/")).status_code == 401
