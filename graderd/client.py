@@ -166,7 +166,7 @@ def _presence(path: Path) -> _Presence:
 def _configured_socket() -> list[Path]:
     """``api.socket`` of the machine's configuration, read without judging the rest."""
     try:
-        socket_path = tomllib.loads(places.CONFIG.read_text(encoding="utf-8"))["api"]["socket"]
+        socket_path = tomllib.loads(places.config().read_text(encoding="utf-8"))["api"]["socket"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
     return [Path(socket_path)] if isinstance(socket_path, str) and socket_path else []

@@ -20,7 +20,11 @@ class TcpSettings(Settings):
     stop_port_n: int | None = Field(
         None, ge=0, le=65535, description="TCP port that serves stop alone; none: the one after port_n"
     )
-    token_file: Path = Field(places.TOKENS, description="tokens that clients must send, hashed; see 'graderd token'")
+    token_file: Path = Field(
+        default_factory=places.tokens,
+        description=f"tokens that clients must send, hashed; see 'graderd token'. Default: {places.STATE}/api-tokens; "
+        "where nothing is installed, ~/.local/state/graderd/api-tokens",
+    )
     certificate_file: Path | None = Field(
         None, description="PEM certificate, and those up to its authority; with it the interface speaks TLS alone"
     )

@@ -81,7 +81,7 @@ def make_cli() -> typer.Typer:
         socket: Annotated[
             Path | None,
             typer.Option(
-                help="The daemon's socket. Default: $GRADERD_SOCKET, else what /etc/graderd/graderd.toml says, else "
+                help="The daemon's socket. Default: $GRADERD_SOCKET, else what the configuration says, else "
                 "/run/graderd/graderd.sock, else $XDG_RUNTIME_DIR/graderd/graderd.sock.",
             ),
         ] = None,

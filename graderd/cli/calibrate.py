@@ -14,7 +14,17 @@ import typer
 from graderd import places
 from graderd.cli import calibrate_color, calibrate_lifts, calibrate_rotation
 from graderd.cli.asking import agree
-from graderd.cli.console import CliError, ExitCode, Json, client_of, example, plain_table, print_json, print_text
+from graderd.cli.console import (
+    DEFAULT_CONFIG,
+    CliError,
+    ExitCode,
+    Json,
+    client_of,
+    example,
+    plain_table,
+    print_json,
+    print_text,
+)
 from graderd.hal.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -66,7 +76,7 @@ def register(app: typer.Typer) -> None:
         angles_deg: Annotated[
             str, typer.Option(metavar="LIST", help="Blade angles to turn to, where the servo turns the blade.")
         ] = DEFAULT_ANGLES_DEG,
-        config: Annotated[Path | None, typer.Option(help=f"Configuration to change. Default: {places.CONFIG}.")] = None,
+        config: Annotated[Path | None, typer.Option(help=f"Configuration to change. {DEFAULT_CONFIG}")] = None,
         save: Annotated[Path, typer.Option(metavar="FILE", help="Where the picture with the result goes.")] = Path(
             "calibration.jpg"
         ),
@@ -85,7 +95,7 @@ def register(app: typer.Typer) -> None:
         """
         if json and not yes:
             raise CliError("calibrate", "--json cannot ask", "Add --yes to consent", ExitCode.USAGE)
-        path = config or places.CONFIG
+        path = config or places.config()
         settings = load_config(path, must_exist=config is not None)
         start_pose = _pose(pose)
         may_write(path)

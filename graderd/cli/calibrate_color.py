@@ -15,7 +15,7 @@ import typer
 from graderd import places
 from graderd.cli.asking import agree
 from graderd.cli.classify import summary_text
-from graderd.cli.console import CliError, ExitCode, Json, example, print_json, print_text
+from graderd.cli.console import DEFAULT_CONFIG, CliError, ExitCode, Json, example, print_json, print_text
 from graderd.core.soil import ColorMethod
 from graderd.hal.errors import DeviceError
 
@@ -34,7 +34,7 @@ def register(group: typer.Typer) -> None:
             Path, typer.Option("--from", metavar="FRAME_SET", help="Frames of this site, labelled in manifest.csv.")
         ],
         method: Annotated[ColorMethod, typer.Option(help="Which method to measure.")] = "fast_color",
-        config: Annotated[Path | None, typer.Option(help=f"Configuration to change. Default: {places.CONFIG}.")] = None,
+        config: Annotated[Path | None, typer.Option(help=f"Configuration to change. {DEFAULT_CONFIG}")] = None,
         yes: Annotated[bool, typer.Option("--yes", help="Consent: write the result unasked.")] = False,
         json: Json = False,
     ) -> None:
@@ -60,7 +60,7 @@ def _color(source: Path, method: ColorMethod, config: Path | None, yes: bool, as
     from graderd.perception.scoring import Score, site_figure
 
     cv2.setNumThreads(1)
-    path = config or places.CONFIG
+    path = config or places.config()
     settings = load_config(path, must_exist=config is not None).perception
     settings = settings.model_copy(update={"method": method})
     may_write(path)

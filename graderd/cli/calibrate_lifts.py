@@ -80,7 +80,7 @@ def _ask() -> End:
 def _exchange(client: Client, config: Path | None) -> None:
     from graderd.cli.calibrate import write_calibration
 
-    path = config or places.CONFIG
+    path = config or places.config()
     running: dict[str, Any] = client.config()
     left_n, right_n = (running.get(name, {}).get("address_n") for name in LIFTS)
     if left_n is None or right_n is None:

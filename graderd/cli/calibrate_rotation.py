@@ -106,7 +106,7 @@ def register(group: typer.Typer) -> None:
         """
         from graderd.cli.calibrate import load_config, may_write, write_calibration
 
-        client, path = client_of(context), config or places.CONFIG
+        client, path = client_of(context), config or places.config()
         may_write(path)
         running = _running(client)
         ratio = getattr(load_config(path, must_exist=config is not None).rotation, "gear_ratio", None)

@@ -12,6 +12,7 @@ import typer
 
 from graderd import places
 from graderd.cli.console import (
+    DEFAULT_CONFIG,
     CliError,
     ExitCode,
     Json,
@@ -27,8 +28,8 @@ from graderd.hal.text import printable
 if TYPE_CHECKING:
     from graderd.config import Config
 
-File = Annotated[Path | None, typer.Argument(help="Default: /etc/graderd/graderd.toml if it exists.")]
-Which = Annotated[Path | None, typer.Option("--config", help="Default: /etc/graderd/graderd.toml.")]
+File = Annotated[Path | None, typer.Argument(help=DEFAULT_CONFIG)]
+Which = Annotated[Path | None, typer.Option("--config", help=DEFAULT_CONFIG)]
 
 
 def register(app: typer.Typer) -> None:
@@ -47,7 +48,7 @@ def _looking(config: typer.Typer) -> None:
 
         Every mistake gets a line with place, cause and remedy. What 'run' would refuse is refused here.
         """
-        _runs(load_or_refuse(file, json), file or places.CONFIG, json)
+        _runs(load_or_refuse(file, json), file or places.config(), json)
         if json:
             print_json({"valid": True, "problems": []})
         else:
@@ -96,19 +97,20 @@ def _looking(config: typer.Typer) -> None:
 
 def _changing(config: typer.Typer) -> None:
 
-    @config.command(epilog=example("sudo graderd config init", "graderd config init grader.toml"))
+    @config.command(epilog=example("graderd config init", "sudo graderd config init", "graderd config init new.toml"))
     def init(file: File = None, json: Json = False) -> None:
         """Write a configuration file to begin with: every key with its meaning and its default.
 
-        A file that is there is left as it is.
+        Written where 'graderd run' of the same user reads it; what a user's own daemon keeps goes to
+        ~/.local/state/graderd. A file that is there is left as it is.
         """
         from graderd.config import template
 
-        path = file or places.CONFIG
+        path = file or places.config()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("x", encoding="utf-8") as made:
-                made.write(template.template())
+                made.write(template.template(places.state_of(path)))
         except FileExistsError:
             remedy = "change it with 'graderd config set', or name another file"
             raise CliError(str(path), "there is such a file", remedy) from None
@@ -131,7 +133,7 @@ def _changing(config: typer.Typer) -> None:
         from graderd.config import ConfigError, parse
         from graderd.config.rewrite import merged, rewrite
 
-        path = config or places.CONFIG
+        path = config or places.config()
         change: Any = _given(value)
         for part in reversed(key.split(".")):
             change = {part: change}
@@ -162,7 +164,7 @@ def _changing(config: typer.Typer) -> None:
         from graderd.config.loader import decode
         from graderd.config.rewrite import backups_of, rewrite
 
-        path = file or places.CONFIG
+        path = file or places.config()
         backups = backups_of(path)
         if list_:
             names = [backup.name for backup in reversed(backups)]

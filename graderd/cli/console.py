@@ -10,10 +10,11 @@ import sys
 from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from graderd import places
 from graderd.client import Client
 from graderd.hal.text import printable, terminal_safe_json
 
@@ -41,6 +42,9 @@ class CliError(Exception):
         self.cause = cause
         self.remedy = remedy
         self.exit_code = exit_code
+
+
+DEFAULT_CONFIG: Final = f"Default: {places.CONFIG}; where there is none, your own in ~/.config/graderd."
 
 
 def client_of(context: typer.Context) -> Client:

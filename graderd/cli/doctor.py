@@ -15,7 +15,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from graderd import places
-from graderd.cli.console import CliError, ExitCode, Json, client_of, example, print_json, print_table, print_text
+from graderd.cli.console import (
+    DEFAULT_CONFIG,
+    CliError,
+    ExitCode,
+    Json,
+    client_of,
+    example,
+    print_json,
+    print_table,
+    print_text,
+)
 from graderd.client import ClientError
 from graderd.hal.text import printable
 
@@ -23,7 +33,7 @@ if TYPE_CHECKING:
     from graderd.config import Config
     from graderd.doctor import Finding
 
-File = Annotated[Path | None, typer.Option("--config", help="Default: /etc/graderd/graderd.toml if it exists.")]
+File = Annotated[Path | None, typer.Option("--config", help=DEFAULT_CONFIG)]
 SERVICE_S = 10.0
 TAIL_BYTES = 2_000_000
 """So much of the newest recording: some minutes."""
@@ -126,7 +136,7 @@ def _parts(context: typer.Context, path: Path | None) -> Iterator[tuple[str, str
             yield name, without_secrets(json.dumps(client.get(ask), indent=1))
     config, _ = _configuration(path)
     with suppress(OSError):
-        yield "graderd.toml", without_secrets((path or places.CONFIG).read_text("utf-8", "replace"))
+        yield "graderd.toml", without_secrets((path or places.config()).read_text("utf-8", "replace"))
     commands = {
         "journal.txt": ("journalctl", "--unit=graderd", "--lines=5000", "--output=short-iso-precise", "--no-pager"),
         "kernel.txt": ("journalctl", "--dmesg", "--lines=500", "--no-pager"),

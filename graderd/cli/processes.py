@@ -11,7 +11,17 @@ from typing import Annotated
 
 import typer
 
-from graderd.cli.console import TAKES_ANYTHING, CliError, ExitCode, Json, client_of, example, hand_over, print_json
+from graderd.cli.console import (
+    DEFAULT_CONFIG,
+    TAKES_ANYTHING,
+    CliError,
+    ExitCode,
+    Json,
+    client_of,
+    example,
+    hand_over,
+    print_json,
+)
 from graderd.client import Client
 
 
@@ -37,9 +47,7 @@ def _run(app: typer.Typer) -> None:
     @app.command(epilog=example("graderd run --config /etc/graderd/graderd.toml", "graderd run --sim"))
     def run(
         context: typer.Context,
-        config: Annotated[
-            Path | None, typer.Option(help="Configuration file. Default: /etc/graderd/graderd.toml if it exists.")
-        ] = None,
+        config: Annotated[Path | None, typer.Option(help=f"Configuration file. {DEFAULT_CONFIG}")] = None,
         sim: Annotated[bool, typer.Option("--sim", help="Start a simulated grader and run on that.")] = False,
         rig_dir: Annotated[
             Path | None, typer.Option(help="Run on the simulated grader that serves this directory.")
@@ -68,9 +76,7 @@ def _guard(app: typer.Typer) -> None:
 
     @app.command(epilog=example("graderd guard --config /etc/graderd/graderd.toml"))
     def guard(
-        config: Annotated[
-            Path | None, typer.Option(help="Configuration file. Default: /etc/graderd/graderd.toml if it exists.")
-        ] = None,
+        config: Annotated[Path | None, typer.Option(help=f"Configuration file. {DEFAULT_CONFIG}")] = None,
         json: Json = False,
     ) -> None:
         """Make the machine safe without a daemon.

@@ -21,7 +21,7 @@ import typer
 
 from graderd import places
 from graderd.cli.asking import Answers, agree, answered_by, ask, choice, numbered
-from graderd.cli.console import CliError, ExitCode, client_of, example, print_text
+from graderd.cli.console import DEFAULT_CONFIG, CliError, ExitCode, client_of, example, print_text
 from graderd.cli.setup_daemon import SetupDaemon, is_running
 from graderd.client import Client, RefusedError
 from graderd.core.axes import LIFTS
@@ -78,7 +78,7 @@ def register(app: typer.Typer) -> None:
     )
     def setup(
         context: typer.Context,
-        config: Annotated[Path | None, typer.Option(help=f"Configuration to make. Default: {places.CONFIG}.")] = None,
+        config: Annotated[Path | None, typer.Option(help=f"Configuration to make. {DEFAULT_CONFIG}")] = None,
         rig_dir: Annotated[
             Path | None, typer.Option(help="Set up the simulated grader that serves this directory.")
         ] = None,
@@ -100,7 +100,7 @@ def register(app: typer.Typer) -> None:
         if questions:
             print_text("\n".join(f"{key}: {what}" for key, what in QUESTIONS))
             return
-        path = config or places.CONFIG
+        path = config or places.config()
         with answered_by(_answers(answers)):
             _set_up(client_of(context), path, rig_dir, record or path.with_name("commissioning.json"), again=again)
 
@@ -162,7 +162,6 @@ def _wires(rig_dir: Path | None, path: Path) -> Wires:
 
 def _begin_file(path: Path) -> None:
     """A file to change, with every key explained, where there is none."""
-    from graderd.cli.calibrate import write_calibration
     from graderd.config.template import template
 
     if path.exists():
@@ -170,12 +169,10 @@ def _begin_file(path: Path) -> None:
         return
     try:
         with path.open("x", encoding="utf-8") as made:
-            made.write(template())
+            made.write(template(places.state_of(path)))
     except OSError as error:
         cause = f"cannot be made ({error.strerror})"
         raise CliError(str(path), cause, "Run it with sudo, or name another with --config") from None
-    if config_is_elsewhere(path):  # the service's place for recordings is not this user's
-        write_calibration(path, {"recording": {"directory": ""}})
     print_text(f"{path}: made, with every key and its meaning")
 
 

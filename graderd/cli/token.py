@@ -9,14 +9,14 @@ import typer
 
 from graderd import places
 from graderd.cli.config import load_or_refuse
-from graderd.cli.console import Json, example, print_json, print_table, print_text
+from graderd.cli.console import DEFAULT_CONFIG, Json, example, print_json, print_table, print_text
 from graderd.tokens import Right, create_token, read_tokens, revoke_token
 
 if TYPE_CHECKING:
     from graderd.config import Config
 
 Name = Annotated[str, typer.Argument(help="Whose it is, as the log tells it: up to 32 of a-z 0-9 _ . -")]
-File = Annotated[Path | None, typer.Option("--config", help="Default: /etc/graderd/graderd.toml if it exists.")]
+File = Annotated[Path | None, typer.Option("--config", help=DEFAULT_CONFIG)]
 
 
 def register(app: typer.Typer) -> None:
@@ -72,7 +72,7 @@ def register(app: typer.Typer) -> None:
 
 
 def _file(config: Config) -> Path:
-    return config.api.tcp.token_file if config.api.tcp is not None else places.TOKENS
+    return config.api.tcp.token_file if config.api.tcp is not None else places.tokens()
 
 
 def _page(config: Config) -> str:

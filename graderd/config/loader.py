@@ -31,12 +31,12 @@ class ConfigError(Exception):
 
 
 def load(path: Path | None = None) -> Config:
-    """Read ``path``, or the default path where a file is there, or take the defaults.
+    """Read ``path``, or the one that is meant (:func:`graderd.places.config`) where it is there, or take the defaults.
 
     Raises:
         ConfigError: unreadable, not TOML, or not a valid configuration.
     """
-    wanted = path or places.CONFIG
+    wanted = path or places.config()
     try:
         raw = wanted.read_bytes()
     except FileNotFoundError as error:

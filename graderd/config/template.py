@@ -16,27 +16,33 @@ from typing import Any
 
 import tomlkit
 from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 
+from graderd import places
 from graderd.config.loader import parse
 from graderd.config.models import Config
 
 HEAD = """\
-# graderd's configuration. Read at start; `systemctl restart graderd` after a change (the restart begins disarmed).
+# graderd's configuration. Read at start: after a change end the daemon and start it again, which begins disarmed (an
+# installed one: `systemctl restart graderd`).
 # A line that starts with #key shows a default: take the # away to set something else. Unknown keys are errors.
 # Names end in their unit: _deg _mm _m _s _hz _a _v _c _px, _n for counts and addresses. Left and right are the
 # operator's, facing forward. First steps on a machine: /usr/share/doc/graderd, or man graderd.
 
 """
 
-# What differs from the defaults on an installed machine.
-INSTALLED: dict[str, Any] = {
-    "version": Config.model_fields["version"].default,
-    "recording.directory": "/var/lib/graderd/recordings",
-}
+
+def _begun_with(state: Path) -> dict[str, Any]:
+    """What differs from the defaults: a daemon whose files are at ``state``. The service has that from systemd, but for
+    its recordings, which the commands look for without it."""
+    own = {} if state == places.STATE else {"state.directory": str(state)}
+    return {
+        "version": Config.model_fields["version"].default,
+        "recording.directory": str(state / "recordings"),
+        **own,
+    }
 
 
-def sections(model: BaseModel, path: tuple[str, ...] = ()) -> Iterator[str]:
+def sections(model: BaseModel, begun_with: dict[str, Any], path: tuple[str, ...] = ()) -> Iterator[str]:
     """The text of one table: its own keys first, then its sub-tables."""
     fields = type(model).model_fields
     tables = {name: getattr(model, name) for name in fields if isinstance(getattr(model, name), BaseModel)}
@@ -50,19 +56,20 @@ def sections(model: BaseModel, path: tuple[str, ...] = ()) -> Iterator[str]:
     for name, field in plain.items():
         # A section that is present starts from its class: what this instance has otherwise must be set.
         own = not field.is_required() and getattr(model, name) != field.get_default(call_default_factory=True)
-        yield from _key(name, field, getattr(model, name), path, active=own)
+        dotted = ".".join((*path, name))
+        if field.description:
+            yield "".join(f"# {line}\n" for line in textwrap.wrap(field.description, 116))
+        if dotted in begun_with:
+            yield f"{name} = {_toml(begun_with[dotted])}\n"
+        else:
+            yield from _key(name, getattr(model, name), active=own)
     yield "\n"
     for name, value in tables.items():
-        yield from sections(value, (*path, name))
+        yield from sections(value, begun_with, (*path, name))
 
 
-def _key(name: str, field: FieldInfo, value: Any, path: tuple[str, ...], *, active: bool) -> Iterator[str]:
-    dotted = ".".join((*path, name))
-    if field.description:
-        yield "".join(f"# {line}\n" for line in textwrap.wrap(field.description, 116))
-    if dotted in INSTALLED:
-        yield f"{name} = {_toml(INSTALLED[dotted])}\n"
-    elif active:
+def _key(name: str, value: Any, *, active: bool) -> Iterator[str]:
+    if active:
         yield f"{name} = {_toml(_plain(value))}\n"
     elif value is None:
         yield f"# {name}: not set\n"
@@ -89,13 +96,13 @@ def _toml(value: Any) -> str:
     return str(tomlkit.item(value).as_string())
 
 
-def template() -> str:
-    """The whole file.
+def template(state: Path = places.STATE) -> str:
+    """The whole file, for a daemon that keeps its files at ``state``.
 
     Raises:
         ConfigError: the file, as it is or with every default taken out of its comment, would not be accepted.
     """
-    text = HEAD + "".join(sections(Config())).rstrip() + "\n"
+    text = HEAD + "".join(sections(Config(), _begun_with(state))).rstrip() + "\n"
     for variant in (text, re.sub(r"(?m)^#(?=[\w\[])", "", text)):
         parse(tomlkit.parse(variant).unwrap(), text=variant)
     return text

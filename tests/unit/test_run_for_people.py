@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from graderd import places
+from graderd.cli.app import run_app
 from graderd.client import Client, default_socket
-from graderd.config import Config
+from graderd.config import Config, load
 from graderd.runtime.app.daemon import served_at
 
 
@@ -71,3 +72,33 @@ def test_run_sim_without_root_and_configuration_and_soil_laid_by_a_command(runti
         daemon.send_signal(signal.SIGINT)
         assert daemon.wait(20) == 0
     assert list(runtime.iterdir()) == [], "nothing is left behind"
+
+
+def test_an_ordinary_users_configuration_is_made_where_his_daemon_reads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(places, "CONFIG", tmp_path / "etc" / "graderd.toml")
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    own = tmp_path / "config" / "graderd" / "graderd.toml"
+    assert load() == Config(), "there is none yet"
+    assert run_app(["config", "init"]) == 0
+    assert str(own) in capsys.readouterr().out
+    read = load()
+    assert read.recording.directory == str(tmp_path / "state" / "graderd" / "recordings")
+    assert read.state.directory == str(tmp_path / "state" / "graderd")
+    assert run_app(["config", "set", "rotation.max_deg", "45"]) == 0
+    assert load().rotation.max_deg == 45
+    assert places.tokens() == tmp_path / "state" / "graderd" / "api-tokens"
+
+    monkeypatch.setenv("XDG_CONFIG_HOME", "somewhere/relative")  # which counts for nothing
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert places.config() == tmp_path / "home" / ".config" / "graderd" / "graderd.toml"
+    places.CONFIG.parent.mkdir()
+    places.CONFIG.touch()
+    assert places.config() == places.CONFIG, "a machine has one configuration"
+    assert places.state_of(places.CONFIG) == places.STATE
+    places.CONFIG.unlink()
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    assert places.config() == places.CONFIG, "what root makes is the machine's"

@@ -75,4 +75,4 @@ def is_of(last: LastRun, source: Path | None) -> bool:
 
 
 def _absolute(source: Path | None) -> Path:
-    return Path(os.path.abspath(source or places.CONFIG))
+    return Path(os.path.abspath(source or places.config()))
