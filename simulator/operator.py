@@ -357,11 +357,14 @@ class Operator:
     async def _drive(self) -> list[dict[str, Any]]:
         """Drive through the soil, automatic operation going on; the rig's truth on the way."""
         way = self._way
+        mode = (await self.status()).mode
         await self._rig.request("drive", speed_m_per_s=way.speed_m_per_s, distance_m=way.distance_m)
         deadline_s = time.monotonic() + way.distance_m / way.speed_m_per_s + STALLED_S
         states = []
         while True:
-            await self.status()
+            status = await self.status()
+            if status.mode != mode:  # what the blade does from here on is no trial of its angle
+                raise PassFailedError(f"{mode} operation ended on the way: {status.mode}, {status.reason}")
             states.append(await self._rig.request("state"))
             if not states[-1]["driving"]:
                 break

@@ -24,13 +24,14 @@ KEYS = {Work.LEFT: "left_deg", Work.MIDDLE: "center_deg", Work.FLATTENING: "even
 @dataclass(frozen=True, slots=True)
 class Choice:
     """The best angle (counter-clockwise) for one distribution: None where it is not told from ``rivals_deg``, or where
-    nothing was computed. ``measure``: what is best at it."""
+    nothing was computed. ``measure``: what is best at it. ``runs_n``: that it rests on, of one pile, gap and grain."""
 
     work: Work
     angle_deg: float | None
     measure: str
     rows: tuple[Row, ...]
     rivals_deg: tuple[float, ...]
+    runs_n: int
 
     def reason(self) -> str:
         """One line for people."""
@@ -55,8 +56,12 @@ class Rule:
 
     machine: Case
     choices: tuple[Choice, ...]
-    runs_n: int
     engine: str
+
+    @property
+    def runs_n(self) -> int:
+        """The runs that it rests on; others of the machine are of another pile, gap or grain."""
+        return sum(choice.runs_n for choice in self.choices)
 
     def angles_deg(self) -> dict[str, float]:
         """By the configuration's names; those alone that the results carry."""
@@ -111,7 +116,7 @@ def derive(results: Iterable[Result], like: Case | None = None) -> Rule:
         raise StudyError("rule", "nothing has been computed", "Run `graderd study paper` or a sweep first")
     group = max(groups.values(), key=len)
     choices = tuple(_choice(work, [each for each in group if each.case.work is work]) for work in KEYS)
-    return Rule(group[0].case, choices, len(group), group[0].engine)
+    return Rule(group[0].case, choices, group[0].engine)
 
 
 def _choice(work: Work, results: Sequence[Result]) -> Choice:
@@ -121,7 +126,7 @@ def _choice(work: Work, results: Sequence[Result]) -> Choice:
         same.setdefault(result.case.model_dump_json(exclude={"angle_deg", "sense", "seed"}), []).append(result)
     measure = LOAD if work is Work.FLATTENING else SPREAD
     if not same:
-        return Choice(work, None, measure, (), ())
+        return Choice(work, None, measure, (), (), 0)
     trials = [
         TrialResult(work, result.case.angle_ccw_deg, result.case.seed, _values(result, measure))
         for result in max(same.values(), key=len)
@@ -144,7 +149,7 @@ def _choice(work: Work, results: Sequence[Result]) -> Choice:
         # The load decides where the work is as good at each angle, which it is not here.
         rivals = rivals or [row.angle_deg for row in chosen if row is not best]
     angle = None if rivals or len(chosen) < 2 else best.angle_deg
-    return Choice(work, angle, measure, chosen, () if angle is not None else (best.angle_deg, *rivals))
+    return Choice(work, angle, measure, chosen, () if angle is not None else (best.angle_deg, *rivals), len(trials))
 
 
 def _values(result: Result, measure: str) -> dict[str, Estimate]:

@@ -6,6 +6,8 @@ import asyncio
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import AsyncMock, Mock
 
 import numpy as np
 import pytest
@@ -29,7 +31,7 @@ from graderd.simulator.experiment import (
     trials,
 )
 from graderd.simulator.grader.soil import SoilField
-from graderd.simulator.operator import Pass
+from graderd.simulator.operator import Operator, Pass, PassFailedError
 
 PASS = Pass(
     "left", "left", 30.0, 30.1, 1.0, tuple(
@@ -151,3 +153,15 @@ def _heap() -> SoilField:
     field = SoilField()
     field.heights_m[150:170, 40:60] = 0.1
     return field
+
+
+async def test_a_way_on_which_the_machine_leaves_its_operation_is_no_trial() -> None:
+    """The blade is held from there on: what lies behind it is not of the angle that the trial is filed under."""
+    said = iter(["auto", "auto", "auto", "disarmed"])
+    client = AsyncMock()
+    client.status.side_effect = lambda: SimpleNamespace(mode=next(said), reason="lift_left is lost")
+    rig = AsyncMock()
+    rig.request.return_value = {"driving": True}
+    operator = Operator(client, rig, Mock())
+    with pytest.raises(PassFailedError, match="auto operation ended on the way: disarmed, lift_left is lost"):
+        await operator._drive()
