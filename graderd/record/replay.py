@@ -161,6 +161,8 @@ def _pictures(
         was = judged.observation
         # How long it took is no part of what was seen; the recorded time keeps what follows comparable.
         seen = replace(seen, cpu_ms=was.cpu_ms)
+        if was.profile_mm is None:  # nor what was not measured yet when it was recorded
+            seen = replace(seen, profile_mm=None)
         found.frames_n += 1
         today[was.frame_number] = seen
         if seen != was:
