@@ -499,7 +499,7 @@ class ServoTask:
     async def _leave_witness(self, device: Ph54Device) -> None:
         """The servo's RAM shall say whether its turns are known."""
         if (due := self._observer.witness_due) is not None:
-            await device.write_block(device.witness_block, due)
+            await device.write_block(device.witness_block, due, attempts_n=1)  # it stays due
             self._observer.witness_due = None
 
     def _standing_goal_deg(self) -> float | None:
@@ -545,12 +545,16 @@ class ServoTask:
         try:
             await step
         except DeviceTimeoutError as e:
-            silent_s, unanswered_n = self._link.silence()
-            if silent_s > self._settings.reply_timeout_s and unanswered_n >= _UNANSWERED_N:
-                c = self._link.counters()
+            if self._is_silent():
+                silent_s, c = self._link.silence()[0], self._link.counters()
                 seen = f"{c.get('requests_n', 0)} requests, {c.get('foreign_n', 0)} replies with another id"
                 cause = f"no valid status packet for {silent_s:.2f} s ({seen})"
                 raise DeviceTimeoutError(e.where, cause, e.remedy) from e
+
+    def _is_silent(self) -> bool:
+        """Whether the servo is lost: a program that stood still would have asked nothing, hence the requests."""
+        silent_s, unanswered_n = self._link.silence()
+        return silent_s > self._settings.reply_timeout_s and unanswered_n >= _UNANSWERED_N
 
     async def _send_command(self, device: Ph54Device) -> None:
         """Send what was commanded last: a hold, or a goal that is not on the servo yet."""
@@ -574,8 +578,12 @@ class ServoTask:
         too_old = self._clock.now_s() - observer.motion.time_s > _OLD_S
         in_doubt = command.sent_hold_after(observer.motion)
         if too_old or in_doubt:
-            with contextlib.suppress(DeviceTimeoutError):
-                await observer.read_telemetry(device, None, attempts_n=_IN_DOUBT_N if in_doubt else 1)
+            for _ in range(_IN_DOUBT_N if in_doubt else 1):
+                with contextlib.suppress(DeviceTimeoutError):
+                    await observer.read_telemetry(device, None)
+                    break
+                if self._is_silent():
+                    break  # more questions would only put off that it is told
         observer.note_sent(await command.send_hold(device, observer.motion, self._clock.now_s()))
 
     async def _on_refusal(self, device: Ph54Device, error: DeviceRefusedError) -> None:

@@ -42,6 +42,18 @@ async def test_an_answer_that_takes_long_is_told_within_the_configured_time(rig:
     assert 0.1 < rig.clock.now_s() - began_s < 1.0  # reply_timeout_s is 0.25
 
 
+async def test_a_hold_that_goes_unanswered_puts_off_nothing(rig: Bench) -> None:
+    """Whether it was taken is asked for, but no longer than until the servo counts as lost: seven requests."""
+    await rig.rotator.arm()
+    await rig.drive(50.0, rig.past(13.0))
+    rig.bus.inject("delay", seconds=0.4)
+    before_n = rig.rotator.telemetry().counters["timeouts_n"]
+    await rig.until(lambda: rig.rotator.telemetry().counters["timeouts_n"] - before_n >= 2)
+    rig.rotator.hold()
+    await rig.until(lambda: "no_reply" in rig.conditions())
+    assert rig.rotator.telemetry().counters["timeouts_n"] - before_n <= 8
+
+
 async def test_corrupt_replies_are_named_and_never_believed(rig: Bench) -> None:
     await armed_at(rig, 5.0)
     rig.bus.inject("flip", rate=0.3)
