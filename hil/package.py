@@ -285,8 +285,8 @@ def main() -> int:
             root = scratch / "upgraded"
             clean_root(root, SUITES[0], options.mirror)
             apt_install(root, package)
-            release_upgrade(root, package)
             lay_out(root, package, scratch)
+            release_upgrade(root, package)
             status = live(root, package, RESULTS / "package" / root.name)
     return status
 
