@@ -288,8 +288,8 @@ CLAIMS: Final = (
     Mutant(
         "F9-lost-servo",
         "drivers/dynamixel/servo_task.py",
-        "            if silent_s > self._settings.reply_timeout_s and unanswered_n >= _UNANSWERED_N:\n",
-        "            if False:\n",
+        "        return silent_s > self._settings.reply_timeout_s and unanswered_n >= _UNANSWERED_N\n",
+        "        return False\n",
         ("tests/fault/test_dynamixel_faults.py::test_no_reply_fails_the_rotator_stops_the_blade_and_heals",),
         "a servo that does not answer is not lost",
     ),

@@ -103,6 +103,10 @@ async def until(met: Callable[[], object], what: str, timeout_s: float = TIMEOUT
         await asyncio.sleep(0.005)
 
 
+LOST_S = 0.25
+"""As the configuration has it: for tests of what is told of a servo that does not answer."""
+
+
 @asynccontextmanager
 async def bench(
     folder: Path,
@@ -117,7 +121,9 @@ async def bench(
     clock = AwakeClock()
     bus = VirtualServoBus([servo], folder / "servo", clock=clock, **(wire or {}))
     brisk = {"speed_deg_per_s": 50.0, "acceleration_deg_per_s2": 200.0}  # so that tests need not wait for the blade
-    settings = Ph54Settings(**{"port": str(folder / "servo"), **brisk, **changes})
+    # Without a processor to spare seven answers in a row are held back: whoever tests a lost servo says when it is one.
+    patient = {"reply_timeout_s": 1.0}
+    settings = Ph54Settings(**{"port": str(folder / "servo"), **brisk, **patient, **changes})
     rotator = Ph54Rotator(settings, clock=clock)
     await bus.start()
     try:

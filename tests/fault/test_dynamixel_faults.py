@@ -10,14 +10,14 @@ import pytest
 from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceError, DeviceRefusedError
 from graderd.simulator.servo import FAULTS, VirtualServo
-from tests.dynamixel_sim import Bench, armed_at, bench, standing, works_again
+from tests.dynamixel_sim import LOST_S, Bench, armed_at, bench, standing, works_again
 
 ALERTS = sorted(name for name in FAULTS if name.startswith("alert_"))
 
 
 @pytest.fixture
 async def rig(tmp_path: Path) -> AsyncIterator[Bench]:
-    async with bench(tmp_path) as made:
+    async with bench(tmp_path, reply_timeout_s=LOST_S) as made:
         yield made
 
 

@@ -12,12 +12,12 @@ from graderd.drivers.dynamixel.bus import ServoBus
 from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError, LifecycleError, WrongDeviceError
 from tests.contract.conformance import all_known, state
-from tests.dynamixel_sim import Bench, bench
+from tests.dynamixel_sim import LOST_S, Bench, bench
 
 
 @pytest.fixture
 async def rig(tmp_path: Path) -> AsyncIterator[Bench]:
-    async with bench(tmp_path, wire={"seed": 5}) as made:
+    async with bench(tmp_path, wire={"seed": 5}, reply_timeout_s=LOST_S) as made:
         yield made
 
 
@@ -46,7 +46,7 @@ async def test_15_percent_loss_is_told_and_nothing_else_happens(tmp_path: Path) 
 
 async def _loses(folder: Path, seed: int, exchanges_n: int) -> None:
     """A line of its own that loses 15 % of so many exchanges: told, and the servo is driven on."""
-    async with bench(folder, wire={"seed": seed}, poll_hz=200.0) as rig:
+    async with bench(folder, wire={"seed": seed}, poll_hz=200.0, reply_timeout_s=LOST_S) as rig:
         await rig.rotator.arm()
         rig.bus.inject("drop", rate=0.08)
         rig.bus.inject("drop_requests", rate=0.08)

@@ -231,6 +231,7 @@ async def test_arming_that_is_broken_off_leaves_no_torque(rig: Bench, what: str,
 
 
 async def test_closing_an_arming_that_has_just_switched_torque_on_switches_it_off(rig: Bench) -> None:
+    rig.bus.inject("delay", seconds=0.03)  # it is on before the driver hears of it
     arming = asyncio.create_task(rig.rotator.arm())
     await rig.until(lambda: rig.servo.torque_enabled)
     await rig.rotator.close()

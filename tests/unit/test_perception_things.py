@@ -31,6 +31,12 @@ def renderer() -> Renderer:
     return Renderer(COLOR_SIZE, DEPTH_SIZE, seed=7)
 
 
+@pytest.fixture(autouse=True)
+def same_noise_for_each_test() -> None:
+    """Whatever ran before it: the renderer's noise goes on from picture to picture."""
+    renderer.cache_clear()
+
+
 def judged(frame: Frame, angle_deg: float, method: Method = "depth") -> SoilObservation:
     classifier = make_classifier(PerceptionSettings(method=method), CameraCalibration(), BladeGeometry(), live=False)
     return classifier.classify(frame, angle_deg, 0.0, ON_GROUND)
