@@ -88,8 +88,8 @@ async def test_a_lease_moves_and_is_given_back_at_the_end_of_its_block(tmp_path:
                     break
             lease.preset("transport")
             for status in lease.statuses():
-                if status.axes["lift_left"].measured == 200.0:
-                    break
+                if (status.axes["lift_left"].measured, status.axes["rotation"].measured) == (200.0, 0.0):
+                    break  # the blade too, from where the next jog is told
 
     async def on_a_loop(path: Path) -> None:
         async with AsyncClient(path, name="test") as client, client.lease("async") as lease:
