@@ -29,6 +29,6 @@ def test_a_leaked_task_fails_its_test(pytester: pytest.Pytester) -> None:
             await asyncio.create_task(asyncio.sleep(0))
         """
     )
-    result = pytester.runpytest_subprocess("-p", "no:cacheprovider")
+    result = pytester.runpytest_subprocess("-p", "no:cacheprovider", "-p", "no:rerunfailures")
     result.assert_outcomes(passed=2, errors=1)
     result.stdout.fnmatch_lines(["*tasks left running: left-behind*"])
