@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -124,6 +125,12 @@ def test_a_rule_is_what_the_configuration_takes(tmp_path: Path) -> None:
     path.write_text(derived.toml(), encoding="utf-8")
     config = load_config(path).rule
     assert (config.left_deg, config.right_deg, config.center_deg, config.even_deg) == (-30, 30, 30, 45)
+
+
+def test_a_rule_names_the_runs_that_it_rests_on_and_no_others() -> None:
+    middle = results(lambda case: 2000.0 - case.angle_deg, lines("middle"))
+    others = [replace(each, case=each.case.model_copy(update={"gap_m": 0.15})) for each in middle[:2]]
+    assert rule.derive(middle + others).runs_n == rule.derive(middle).runs_n == len(middle)
 
 
 def test_a_rule_claims_no_more_than_its_intervals() -> None:
