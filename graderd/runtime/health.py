@@ -20,11 +20,18 @@ STEP_S = 2.0
 STEP_SHOWN_S = 10.0
 
 
-class HealthWatch:
-    """Control runs on the monotonic clock, so a stepped wall clock moves nothing; it is told because records jump."""
+def resident_mb() -> float:
+    """The memory of this process that is in RAM, in MB, what it shares with others included."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * resource.getpagesize() / 1e6
 
-    def __init__(self, config: Config) -> None:
-        self._limit_mb = config.control.memory_warn_mb
+
+class HealthWatch:
+    """Control runs on the monotonic clock, so a stepped wall clock moves nothing; it is told because records jump.
+    ``resident_mb``: see :func:`resident_mb`."""
+
+    def __init__(self, config: Config, resident_mb: Callable[[], float] = resident_mb) -> None:
+        self._limit_mb, self._resident_mb = config.control.memory_warn_mb, resident_mb
         self._offset_s = _wall_offset_s()
         self._faults = PresentFaults("daemon")
 
@@ -41,7 +48,7 @@ class HealthWatch:
         step_s, self._offset_s = offset_s - self._offset_s, offset_s
         if abs(step_s) > STEP_S:
             self._faults.tell("clock_stepped", f"the wall clock was stepped by {step_s:+.0f} s", now_s, STEP_SHOWN_S)
-        memory_mb = _resident_mb()
+        memory_mb = self._resident_mb()
         detail = f"{memory_mb:.0f} MB in use, {self._limit_mb:g} MB expected at most"
         self._faults.keep("memory_high", memory_mb > self._limit_mb, detail, now_s)
 
@@ -82,11 +89,6 @@ class SleepWatch:
             self._faults.tell("suspended", f"it slept for {slept_s - self._slept_s:.1f} s", now_s)
         self._slept_s = max(self._slept_s, slept_s)
         return self._faults.present(now_s)
-
-
-def _resident_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * resource.getpagesize() / 1e6
 
 
 HANGS_S = 1.5

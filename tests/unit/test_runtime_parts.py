@@ -9,6 +9,7 @@ import socket
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from graderd.config import Config, parse
@@ -22,7 +23,7 @@ from graderd.runtime import devices as devices_module
 from graderd.runtime import state_file
 from graderd.runtime.app.perception_child import AngleHistory, settings_not_kept
 from graderd.runtime.devices import Devices, open_devices
-from graderd.runtime.health import HealthWatch, SleepWatch, slept_s
+from graderd.runtime.health import HealthWatch, SleepWatch, resident_mb, slept_s
 from graderd.runtime.sd_notify import SystemdNotifier
 from graderd.runtime.state_file import StateFile
 from graderd.runtime.status import build_status
@@ -170,7 +171,7 @@ def test_without_systemd_or_with_its_socket_gone_nothing_happens(tmp_path: Path)
 
 
 def test_a_stepped_clock_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    watch = HealthWatch(Config())
+    watch = HealthWatch(Config(), resident_mb=lambda: 100.0)  # not the tests' own: it grows with every test
     watch.measure()
     assert watch.faults(time.monotonic()) == ()
     real = time.time
@@ -210,9 +211,12 @@ def test_this_computer_tells_how_long_it_slept() -> None:
 
 
 def test_high_memory_is_told() -> None:
-    watch = HealthWatch(parse({"control": {"memory_warn_mb": 1.0}}))
-    watch.measure()
-    assert [fault.condition for fault in watch.faults(time.monotonic())] == ["memory_high"]
+    assert resident_mb() == pytest.approx(psutil.Process().memory_info().rss / 1e6, rel=0.05)
+    readings_mb = iter((200.0, 201.0, 199.0))
+    watch = HealthWatch(parse({"control": {"memory_warn_mb": 200.0}}), resident_mb=lambda: next(readings_mb))
+    for told in ([], ["memory_high"], []):
+        watch.measure()
+        assert [fault.condition for fault in watch.faults(time.monotonic())] == told
 
 
 def test_the_angle_at_the_moment_of_exposure() -> None:
