@@ -426,10 +426,13 @@ class LiftPair:
             if not all(side.known for side in moving):
                 shortest_mm = min(abs(side.way_mm) for side in moving)
                 most_share = min(most_share, settings.first_share * longest_mm / shortest_mm)
+        gains_mm_per_s = [side.gain_mm_per_s for side in self._sides]
+        fastest_mm_per_s = [min(most_share * gain, self._max_speed_mm_per_s) for gain in gains_mm_per_s]
         pace_mm_per_s = min(
             (
-                min(most_share * side.gain_mm_per_s, self._max_speed_mm_per_s) * longest_mm / abs(side.way_mm)
-                for side in moving
+                fastest * longest_mm / abs(side.way_mm)
+                for side, fastest in zip(self._sides, fastest_mm_per_s, strict=True)
+                if abs(side.way_mm) > _MOVED_MM
             ),
             default=settings.full_speed_mm_per_s,
         )
@@ -439,13 +442,12 @@ class LiftPair:
         behind = 1 - ahead
         # The side behind makes up for it as far as it can go faster, and the side ahead waits for the rest.
         wanted_mm_per_s = settings.catch_up_hz * max(0.0, -ahead_mm[behind])
-        fastest_mm_per_s = min(most_share * self._sides[behind].gain_mm_per_s, self._max_speed_mm_per_s)
-        more_mm_per_s = min(wanted_mm_per_s, max(0.0, fastest_mm_per_s - own_mm_per_s[behind]))
+        more_mm_per_s = min(wanted_mm_per_s, max(0.0, fastest_mm_per_s[behind] - own_mm_per_s[behind]))
         left = 1.0 - more_mm_per_s / wanted_mm_per_s if wanted_mm_per_s else 1.0
         own_mm_per_s[behind] += more_mm_per_s
         own_mm_per_s[ahead] -= left * settings.catch_up_hz * max(0.0, ahead_mm[ahead])
-        for side, speed_mm_per_s in zip(self._sides, own_mm_per_s, strict=True):
-            share = speed_mm_per_s / side.gain_mm_per_s
+        for side, speed_mm_per_s, gain in zip(self._sides, own_mm_per_s, gains_mm_per_s, strict=True):
+            share = speed_mm_per_s / gain
             # One that may be as fast as it slows down to by itself is left to that: it starts sooner when told more.
             side.share = 1.0 if near and share > most_share - _SHARE_STEP else min(max(share, settings.min_share), 1.0)
         return self._commands()

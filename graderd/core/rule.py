@@ -129,6 +129,7 @@ class Decision:
         return f"{self.zone}, kept for this pass since {since}{held}"
 
 
+Votes = tuple[SoilObservation, ...]
 Agreeing = Mapping[Zone, Sequence[SoilObservation]]
 
 
@@ -147,10 +148,8 @@ def decide(
     from. ``travel`` None: the machine does not say how it drives.
     """
     votes = _votes(decision.votes, observation, now_s, rule) if settled and not _reverses(travel, rule) else ()
-    if votes != decision.votes:
-        decision = replace(decision, votes=votes)
     agreeing = _agreeing(votes, rule)
-    decision = _pass(decision, agreeing, now_s, rule, travel)
+    decision = _pass(decision, votes, agreeing, now_s, rule, travel)
     winner = _winner(decision, agreeing, rule) if decision.votes else None
     if winner is not None and winner is decision.zone and decision.kept:
         # The same again; after a hold it gives the blade its angle back.
@@ -172,7 +171,7 @@ def interrupted(decision: Decision, now_s: float, rule: RuleSettings, travel: Tr
     """What a hold of the rotation leaves of a decision: no angle and no votes, for what moves afterwards was decided
     afterwards; the pass, in which nothing else is decided because a camera failed for a moment; and when it was taken,
     for a camera that comes and goes must not let the blade swing more often."""
-    decision = _pass(replace(decision, votes=()), {}, now_s, rule, travel)
+    decision = _pass(decision, (), {}, now_s, rule, travel)
     if decision.kept and decision.begun:
         return replace(decision, angle_deg=None)
     return Decision(decided_s=decision.decided_s)
@@ -186,9 +185,7 @@ def _reverses(travel: Travel | None, rule: RuleSettings) -> bool:
     return travel is not None and travel.speed_m_per_s <= -rule.standing_m_per_s
 
 
-def _votes(
-    votes: tuple[SoilObservation, ...], new: SoilObservation | None, now_s: float, rule: RuleSettings
-) -> tuple[SoilObservation, ...]:
+def _votes(votes: Votes, new: SoilObservation | None, now_s: float, rule: RuleSettings) -> Votes:
     # A picture far ahead of the clock would never grow old: it counts as little as one far behind it.
     kept = tuple(v for v in votes if abs(now_s - v.capture_s) <= rule.vote_max_age_s)
     if new is not None and abs(now_s - new.capture_s) <= rule.vote_max_age_s:
@@ -196,11 +193,13 @@ def _votes(
     return kept
 
 
-def _pass(decision: Decision, agreeing: Agreeing, now_s: float, rule: RuleSettings, travel: Travel | None) -> Decision:
-    """Follow the pass that the decision is kept for, and end it where it ends."""
+def _pass(
+    decision: Decision, votes: Votes, agreeing: Agreeing, now_s: float, rule: RuleSettings, travel: Travel | None
+) -> Decision:
+    """The decision with these votes; follow the pass that it is kept for, and end it where it ends."""
     if not decision.kept:
-        return decision
-    decision = _driven(decision, now_s, rule, travel)
+        return decision if votes == decision.votes else replace(decision, votes=votes)
+    decision = _driven(decision, votes, now_s, rule, travel)
     ended, gone = "", agreeing.get(Zone.NONE, ())
     if _lasted_s(decision.reversing_since_s, travel) >= rule.standing_s:
         ended = "the machine reversed"
@@ -220,18 +219,18 @@ def _lasted_s(since_s: float | None, travel: Travel | None) -> float:
     return travel.time_s - since_s if since_s is not None and travel is not None else float("-inf")
 
 
-def _driven(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel | None) -> Decision:
-    """Count the travel. It goes on while the machine does not say: what is not known makes no pass longer."""
+def _driven(decision: Decision, votes: Votes, now_s: float, rule: RuleSettings, travel: Travel | None) -> Decision:
+    """With these votes, and the travel counted. It goes on while the machine does not say: what is not known makes no
+    pass longer."""
     told = decision.told
     known_m_per_s = told.speed_m_per_s if told is not None else 0.0
     unknown_m_per_s = max(rule.pass_m / rule.pass_s, known_m_per_s)
     if travel is None:
-        if now_s <= decision.counted_s:
-            return decision if decision.silent else replace(decision, silent=True, begun=True)
-        since_m = decision.since_m + unknown_m_per_s * (now_s - decision.counted_s)
-        return replace(decision, begun=True, silent=True, since_m=since_m, counted_s=now_s)
+        counted_s = max(decision.counted_s, now_s)
+        since_m = decision.since_m + unknown_m_per_s * (counted_s - decision.counted_s)
+        return replace(decision, votes=votes, begun=True, silent=True, since_m=since_m, counted_s=counted_s)
     if travel == told and not decision.silent:
-        return decision
+        return decision if votes == decision.votes else replace(decision, votes=votes)
     dt_s = max(0.0, travel.time_s - decision.counted_s)
     if decision.silent or told is None:
         step_m = unknown_m_per_s * dt_s
@@ -240,6 +239,7 @@ def _driven(decision: Decision, now_s: float, rule: RuleSettings, travel: Travel
         step_m = max(travel.travelled_m - told.travelled_m, known_m_per_s * dt_s, 0.0)
     return replace(
         decision,
+        votes=votes,
         begun=decision.begun or _drives_on(travel, rule),
         since_m=decision.since_m + step_m,
         counted_s=max(decision.counted_s, travel.time_s),
@@ -275,7 +275,7 @@ def _may_follow(decision: Decision, zone: Zone, agreeing: Sequence[SoilObservati
     )
 
 
-def _agreeing(votes: tuple[SoilObservation, ...], rule: RuleSettings) -> Agreeing:
+def _agreeing(votes: Votes, rule: RuleSettings) -> Agreeing:
     """The sure votes for what comes, by zone, where they are enough; none where they are for two zones at once."""
     sure: dict[Zone, list[SoilObservation]] = {}
     for vote in votes:

@@ -29,6 +29,11 @@ class Reading(Generic[T_co]):
         """Whether the value is valid and at most ``max_age_s`` old."""
         return self.valid and now_s - self.time_s <= max_age_s
 
+    def age_if_fresh_s(self, now_s: float, max_age_s: float) -> float | None:
+        """:meth:`age_s`, or None where the value is not fresh."""
+        age_s = now_s - self.time_s
+        return max(0.0, age_s) if self.valid and age_s <= max_age_s else None
+
     def fresh(self, now_s: float, max_age_s: float) -> T_co:
         """The value, if valid and at most ``max_age_s`` old.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from functools import lru_cache
 from importlib.metadata import version
@@ -182,8 +181,8 @@ def _axis(name: str, axis: AxisSensed, decided: AxisTick, now_s: float, max_age_
     values: dict[str, Any] = {}
     ages_s: dict[str, float] = {}
     for field, reading, valid_for_s in _readings(told, max_age_s):
-        if reading is not None and reading.is_fresh(now_s, valid_for_s):
-            values[field], ages_s[field] = reading.value, reading.age_s(now_s)
+        if reading is not None and (age_s := reading.age_if_fresh_s(now_s, valid_for_s)) is not None:
+            values[field], ages_s[field] = reading.value, age_s
     return AxisStatus(
         name=name,
         unit=UNITS[name],
@@ -201,25 +200,36 @@ def _axis(name: str, axis: AxisSensed, decided: AxisTick, now_s: float, max_age_
 
 def _readings(
     told: RotatorTelemetry | ActuatorTelemetry, max_age_s: float
-) -> Iterator[tuple[str, Reading[Any] | None, float]]:
+) -> tuple[tuple[str, Reading[Any] | None, float], ...]:
     """Each field of the status, its reading, and for how long that is told: what control acts on, no longer than
     control would; what changes slowly and is asked for seldom, longer; what its driver was told last stays so."""
-    yield "measured", told.position, max_age_s
-    yield "velocity_per_s", told.velocity, max_age_s
-    yield "current_a", told.current_a, max_age_s
-    yield "moving", told.moving, max_age_s
+    of_both = (
+        ("measured", told.position, max_age_s),
+        ("velocity_per_s", told.velocity, max_age_s),
+        ("current_a", told.current_a, max_age_s),
+        ("moving", told.moving, max_age_s),
+    )
     if isinstance(told, RotatorTelemetry):
-        yield "sent", told.goal_sent_deg, math.inf
-        yield "torque_nm", told.torque_nm, max_age_s
-        yield "in_position", told.in_position, max_age_s
-        yield "voltage_v", told.voltage_v, KNOWN_FOR_S
-        yield "temperature_c", told.temperature_c, KNOWN_FOR_S
-        yield "torque_on", told.torque_on, KNOWN_FOR_S
-        return
-    yield "sent", told.target_sent_mm, math.inf
-    yield "duty_percent", told.duty_percent, max_age_s
+        return (
+            *of_both,
+            ("sent", told.goal_sent_deg, math.inf),
+            ("torque_nm", told.torque_nm, max_age_s),
+            ("in_position", told.in_position, max_age_s),
+            ("voltage_v", told.voltage_v, KNOWN_FOR_S),
+            ("temperature_c", told.temperature_c, KNOWN_FOR_S),
+            ("torque_on", told.torque_on, KNOWN_FOR_S),
+        )
+    of_actuators = (
+        *of_both,
+        ("sent", told.target_sent_mm, math.inf),
+        ("duty_percent", told.duty_percent, max_age_s),
+    )
     flags = told.flags
-    if flags is not None:
-        yield "flags", Reading(tuple(sorted(flags.value)), flags.time_s, flags.valid), KNOWN_FOR_S
+    if flags is None:
+        return of_actuators
+    return (
+        *of_actuators,
+        ("flags", Reading(tuple(sorted(flags.value)), flags.time_s, flags.valid), KNOWN_FOR_S),
         # it is reckoned anew with every feedback
-        yield "thermal_load", Reading(told.thermal_load, flags.time_s, flags.valid), KNOWN_FOR_S
+        ("thermal_load", Reading(told.thermal_load, flags.time_s, flags.valid), KNOWN_FOR_S),
+    )
