@@ -133,10 +133,12 @@ class ControlLoop:
         due_s = self._clock.now_s()
         try:
             while True:
-                late_s = max(0.0, self._clock.now_s() - due_s)
+                began_s = self._clock.now_s()
+                late_s = max(0.0, began_s - due_s)
                 self.lateness_s.append(late_s)
                 self.run_tick(late_s)
-                due_s = max(due_s + self._period_s, self._clock.now_s())
+                # From its beginning: a pause of the process in the midst of a tick makes the next one late.
+                due_s = max(due_s + self._period_s, began_s)
                 await asyncio.sleep(max(0.0, due_s - self._clock.now_s()))
         finally:
             await self._power.close()

@@ -510,6 +510,41 @@ async def test_a_late_tick_is_told_for_a_second_and_a_long_one_beside_it(bench: 
     assert bench.loop.tick.faults == ()
 
 
+@pytest.mark.parametrize(
+    ("in_tick_s", "after_s", "told"),
+    [
+        (0.7, 0.0, {"daemon.loop_blocked"}),
+        (0.0, 0.7, {"daemon.loop_blocked"}),
+        (0.15, 0.0, {"daemon.tick_overrun"}),
+        (0.06, 0.0, set()),
+    ],
+)
+async def test_a_pause_is_told_wherever_it_meets_the_loop(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, in_tick_s: float, after_s: float, told: set[str]
+) -> None:
+    """A process that is stopped in the middle of a tick is as late as one that is stopped between two."""
+    clock, seen = bench.machine.clock, list[set[str]]()
+    now_in_s, now_after_s = [in_tick_s], [after_s]
+
+    async def sleep(seconds: float) -> None:
+        clock.advance(seconds)
+        if len(seen) == 4:
+            raise asyncio.CancelledError
+        clock.advance(now_after_s.pop() if now_after_s else 0.0)
+
+    def on_tick() -> None:
+        seen.append({fault.name for fault in bench.loop.tick.faults})
+        clock.advance(now_in_s.pop() if now_in_s else 0.0)
+
+    bench.loop.on_tick = on_tick
+    monkeypatch.setattr("graderd.runtime.control.asyncio.sleep", sleep)
+    with pytest.raises(asyncio.CancelledError):
+        await bench.loop.run()
+    assert seen[1:] == [told] * 3
+    assert max(bench.loop.lateness_s) == pytest.approx(max(in_tick_s - TICK_S, after_s, 0.0))
+    assert [late_s < TICK_S for late_s in bench.loop.lateness_s][2:] == [True] * 2, "a late tick is not made up for"
+
+
 async def test_the_journal_has_mode_client_and_a_fault_that_explain_knows(
     bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
