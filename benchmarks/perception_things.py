@@ -1,10 +1,10 @@
-"""Legs, foliage and pipes before the blade, on empty and loaded beds: what depth makes of them.
+"""Legs, foliage, pipes, boxes, stones and planks before the blade, on empty and loaded beds: what depth makes of them.
 
-    python -m benchmarks.perception_things                # 240 placements
+    python -m benchmarks.perception_things                # 27 placements of each in each third
     python -m benchmarks.perception_things --each 5       # fewer
 
-Every placement is judged on an empty bed, or with a heap in another third. Bars: no thing alone is called a pile, and
-no heap on one side is answered with the other because of it.
+Every placement is judged on an empty bed, or with a heap in another third: what lies before the blade, and what the
+blade will meet. Bars: no thing alone is called a pile, and no heap on one side is answered with the thing's.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ def sweep(each_n: int) -> list[tuple[str, Zone, SceneZone, float, SoilObservatio
 
 def wrong(side: Zone, loaded: SceneZone, observation: SoilObservation) -> str:
     """What is wrong about an answer; empty where nothing is."""
-    if observation.zone is Zone.UNKNOWN:
-        return ""
+    ahead = Zone.UNKNOWN if observation.ahead is None else observation.ahead.zone
     if loaded is SceneZone.NONE:
-        return "" if observation.zone is Zone.NONE else "ghost"
+        return "" if {observation.zone, ahead} <= {Zone.UNKNOWN, Zone.NONE} else "ghost"
     if observation.zone is side:
         return "swap"
-    return ""
+    # A heap is met by the third it is named after, whatever the blade's angle.
+    return "" if ahead in (Zone(str(loaded)), Zone.NONE, Zone.UNKNOWN) else "swap ahead"
 
 
 def main() -> int:
@@ -71,7 +71,7 @@ def main() -> int:
         if problem := wrong(side, loaded, observation):
             bad += 1
             print(f"{problem}: {kind} {side} at {angle_deg:+.0f} deg, soil {loaded}: {observation.zone} "
-                  f"{observation.confidence * 100:.0f} %, {observation.reason}")  # fmt: skip
+                  f"{observation.confidence * 100:.0f} %, {observation.reason}; ahead {observation.ahead}")  # fmt: skip
     for (kind, bed, zone), count in sorted(counts.items()):
         print(f"{kind:<8} {bed:<7} {zone:<8} {count}")
     print(f"{sum(counts.values())} placements, {bad} wrong")

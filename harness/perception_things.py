@@ -1,4 +1,4 @@
-"""Pictures of things that are no soil: legs, foliage, a pipe, boxes and a stone before the rig's blade."""
+"""Pictures of things that are no soil: legs, foliage, a pipe, boxes and stones before the rig's blade."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from graderd.simulator.grader.piles import SceneZone, lay_scene
 from graderd.simulator.grader.soil import SoilField
 
 VEHICLE_X_M = 3.0
-KINDS = ("legs", "foliage", "pipe", "box", "crate", "stone")
+KINDS = ("legs", "foliage", "pipe", "box", "crate", "stone", "boulder", "chest")
 SIDES = {Zone.LEFT: 1.0, Zone.CENTER: 0.0, Zone.RIGHT: -1.0}
+DISTANCE_M = {"legs": (0.14, 0.45), "boulder": (0.24, 0.42), "chest": (0.22, 0.42)}
+"""How far ahead of the face: what is large lies further off, so as not to stand in the blade."""
 DEPTH_SIZE, COLOR_SIZE = (848, 480), (320, 200)
 
 
@@ -43,6 +45,10 @@ def things(kind: str, s_m: float, d_m: float, angle_deg: float, rng: np.random.G
         return (Solid("box", at(s_m, d_m, 0.10), (0.15, 0.15, 0.10), (90, 80, 70), azimuth),)
     if kind == "stone":
         return (Solid("ellipsoid", at(s_m, d_m, 0.05), (0.12, 0.15, 0.08), (120, 120, 120), azimuth),)
+    if kind == "boulder":
+        return (Solid("ellipsoid", at(s_m, d_m, 0.07), (0.17, 0.21, 0.11), (120, 120, 120), azimuth),)
+    if kind == "chest":  # lower than what stands upright
+        return (Solid("box", at(s_m, d_m, 0.075), (0.15, 0.12, 0.075), (90, 80, 70), azimuth),)
     leaves = []
     for _ in range(70):
         s, d = s_m + float(rng.normal(0, 0.08)), d_m + float(rng.normal(0, 0.06))
@@ -63,7 +69,7 @@ def photograph(renderer: Renderer, kind: str, side: Zone, loaded: SceneZone, ang
         lay_scene(field, loaded, VEHICLE_X_M, pose, seed=number)
         Plough(field).settle(VEHICLE_X_M, pose)
     s_m = SIDES[side] * 0.33 + float(rng.uniform(-0.08, 0.08))
-    d_m = float(rng.uniform(0.14, 0.45 if kind == "legs" else 0.27))
+    d_m = float(rng.uniform(*DISTANCE_M.get(kind, (0.14, 0.27))))
     props = things(kind, s_m, d_m, angle_deg, rng)
     state = SceneState(field.heights_m.astype(np.float32), field.cell_m, VEHICLE_X_M, pose, props)
     noise_px = float(rng.uniform(0.09, 0.2))

@@ -365,11 +365,14 @@ class DepthJudge:
         good[:, 0] |= touching
         filled = fill_hidden(height, good, self._repose_m, self._steepest_m)
         threshold = max(settings.min_height_m, settings.noise_factor_ratio * ground.residual_m)
-        forms = sort_out(height, filled, seen, steep, above, ground.residual_m, threshold, form)
+        forms = sort_out(height, filled, seen, steep, above, high, ground.residual_m, threshold, form)
         volumes_l, carried_l, ahead_l = self._split(filled, forms.soil, angle_deg + fix.turn_deg)
         doubtful_l, doubtful_ahead_l = NOTHING, NOTHING
         if forms.doubtful[self._before].any():
-            sure_l, _, sure_ahead_l = self._split(filled, forms.soil & ~forms.doubtful, angle_deg + fix.turn_deg)
+            sure = filled
+            if forms.apart.any():  # what it hides is filled from what else is seen
+                sure = fill_hidden(height, good & ~forms.apart, self._repose_m, self._steepest_m)
+            sure_l, _, sure_ahead_l = self._split(sure, forms.soil & ~forms.doubtful, angle_deg + fix.turn_deg)
             doubtful_l, doubtful_ahead_l = _less(volumes_l, sure_l), _less(ahead_l, sure_ahead_l)
         return HeightMap(
             filled[self._before],

@@ -28,6 +28,8 @@ SPAN_M = 0.5
 """A cone is followed until it has risen so far: heights in a map differ by less."""
 STEEP_TOLERANCE_M = 0.02
 """So far above what could rise there a cell is steep: the noise of a cell's mean is 2 to 6 mm."""
+STEP_M = 0.008
+"""Where a lump ends so much is enough: the edge of a plank 45 mm thick rises by 10 mm more than soil does in a cell."""
 OWN_SPREAD_M = 0.020
 """Heights in one cell spread by this: steep whatever its neighbours are (soil at 60 degrees: 10 mm)."""
 GAP_SPREAD_M = 0.040
@@ -64,57 +66,85 @@ FOOT_CELLS_N = 3
 """A heap's foot runs out below the level at which lumps are told apart: so many cells more count."""
 ENDS_LEAST_N = 6
 """Where fewer cells show how a lump ends, as between the blade's face and a heap, nothing is said by it."""
+WALL_CELLS_N = 2
+"""An upright wall lies in so many cells, whose points spread over its height: they show neither ground nor top."""
 BESIDE_CELLS_N = 2
 """Cells so near to a steep one are not clear of it."""
 CROSS = np.asarray(cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)), dtype=np.uint8)
-SQUARE, BESIDE, FOOT = (np.ones((2 * n + 1,) * 2, dtype=np.uint8) for n in (1, BESIDE_CELLS_N, FOOT_CELLS_N))
+SQUARE, WALL, BESIDE, FOOT = (
+    np.ones((2 * n + 1,) * 2, dtype=np.uint8) for n in (1, WALL_CELLS_N, BESIDE_CELLS_N, FOOT_CELLS_N)
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forms:
     """Masks over the height map: ``soil`` that stands out of the ground; of it ``doubtful`` what lies beside something
-    steep; ``things`` that are no soil; ``weak``: higher than the ground's unevenness, but not enough to tell."""
+    steep or is ``apart``: a piece of a heap that ends in steps by itself, as a thing does whose foot or shadow meets a
+    heap's; ``things`` that are no soil; ``weak``: higher than the ground's unevenness, but not enough to tell."""
 
     soil: Bools
     doubtful: Bools
+    apart: Bools
     things: Bools
     weak: Bools
 
 
 def sort_out(
-    height: F64, filled: F64, seen: Bools, steep: Bools, above: Bools,
+    height: F64, filled: F64, seen: Bools, steep: Bools, above: Bools, high: F64,
     residual_m: float, stands_out_m: float, settings: FormSettings,
 ) -> Forms:  # fmt: skip
     """Sort a height map into soil, things and ground.
 
     ``height`` of the ``seen`` cells and of those that are far ``above`` their neighbours, ``filled``: of the seen ones
-    without the steep cells (which are seen ones), and with what is hidden guessed.
+    without the steep cells (which are seen ones), and with what is hidden guessed. ``high``: how far each is above what
+    could rise there.
     ``stands_out_m``: what soil must rise above the ground somewhere.
     """
     surface = np.where(seen, height, filled)
     low_m = max(settings.lowest_m, 2.0 * residual_m)
     count, labels = cv2.connectedComponents((surface > low_m).view(np.uint8), connectivity=4)
     tall = seen & (height > TALL_M)
-    # Soil runs out into the ground, wherever that is seen beside it. A box or a slab ends all round in a step.
-    ends = tall & _dilated(seen & ~tall, CROSS)
+    # Soil runs out into the ground, wherever that is seen beside it. A box or a plank ends all round in a step.
+    abrupt = steep | (high > STEP_M)
+    low = seen & ~tall
+    low |= _dilated(low, WALL) & ~seen
+    ends = tall & _dilated(low, CROSS)
     rim = above
     if above.any():  # what hangs over it is higher
         rim = above & (height < cv2.dilate(np.where(tall, height, 0.0), CROSS) + LEVEL_M)
     clear = tall & ~_dilated(steep, BESIDE)
-    high = cv2.blur(filled, (3, 3)) > stands_out_m
+    stands_out = cv2.blur(filled, (3, 3)) > stands_out_m
     lump = np.asarray(labels, dtype=np.intp)
     tall_n, core_n, steep_n, ends_n, steps_n, high_n = _counts(
-        lump, count, (tall, clear, tall & steep, ends | rim, (ends & steep) | rim, high)
+        lump, count, (tall, clear, tall & steep, ends | rim, (ends & abrupt) | rim, stands_out)
     )
     is_thing = (core_n * 100.0 < settings.thing_core_percent * tall_n) & (steep_n > 0)
-    is_thing |= (ends_n >= ENDS_LEAST_N) & (steps_n * 100.0 > settings.thing_steps_percent * ends_n)
+    is_thing |= _ends_in_steps(ends_n, steps_n, settings)
     stands = (high_n > 0) & ~is_thing
     is_weak = ~stands & ~is_thing
     is_thing[0] = stands[0] = is_weak[0] = False  # the ground
     things, weak = is_thing.take(lump), is_weak.take(lump)
     foot = _dilated(stands.take(lump), FOOT)
     soil = foot & ~things & ~weak
-    return Forms(soil, soil & _dilated(steep, SQUARE), things, weak)
+    doubtful, apart = soil & _dilated(steep, SQUARE), np.zeros_like(soil)
+    if (steps_n[stands] * 100.0 > settings.thing_steps_percent * ENDS_LEAST_N).any():
+        # Low ground and hidden cells hold a lump together: what a heap and a thing beside it are, seen each by itself.
+        cliff = tall & (high > STEEP_TOLERANCE_M)
+        whole = (tall & ~cliff) | rim
+        count, labels = cv2.connectedComponents(whole.view(np.uint8), connectivity=4)
+        piece = np.asarray(labels, dtype=np.intp)
+        cut = _dilated(cliff, CROSS) | rim
+        ends_n, steps_n = _counts(piece, count, (ends | cut, (ends & abrupt) | cut))
+        is_apart = _ends_in_steps(ends_n, steps_n, settings)
+        is_apart[0] = False
+        apart = soil & _dilated(is_apart.take(piece), SQUARE)
+        doubtful |= apart
+    return Forms(soil, doubtful, apart, things, weak)
+
+
+def _ends_in_steps(ends_n: F64, steps_n: F64, settings: FormSettings) -> Bools:
+    """Of pieces of a map that show so many cells of their border, and so many of those steep: which are no soil."""
+    return (ends_n >= ENDS_LEAST_N) & (steps_n * 100.0 > settings.thing_steps_percent * ends_n)
 
 
 def _dilated(where: Bools, kernel: U8) -> Bools:

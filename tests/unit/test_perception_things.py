@@ -71,18 +71,52 @@ def test_what_lies_there_and_is_no_soil_does_not_count(kind: str, side: Zone) ->
         assert judged(loaded, angle_deg).zone in (Zone(str(opposite)), Zone.UNKNOWN)
 
 
-@pytest.mark.parametrize(("s_m", "half_long_m"), [(0.0, 0.5), (0.33, 0.2), (-0.33, 0.2)])
-def test_a_plank_beyond_the_soils_zone_turns_no_blade(s_m: float, half_long_m: float) -> None:
-    """Flat on the ground it has no form that is not soil's; before the blade lay no pile, ahead of it was one."""
-    plank = Solid("box", (0.49, s_m, 0.03), (0.10, half_long_m, 0.03), (150, 120, 80), 0.0)
+@pytest.mark.parametrize("kind", ["boulder", "chest"])
+@pytest.mark.parametrize("side", SIDES)
+def test_large_stones_and_walls_lower_than_a_leg_are_no_pile(kind: str, side: Zone) -> None:
+    """A wall's points spread over two cells of the map that are no ground: it ends in a step all the same."""
+    for number in (0, 4, 6):
+        angle_deg = (-30.0, 0.0, 15.0, 45.0)[number // 2 % 4]
+        observation = judged(photograph(renderer(), kind, side, SceneZone.NONE, angle_deg, number), angle_deg)
+        assert observation.zone in (Zone.NONE, Zone.UNKNOWN), (number, observation.reason)
+        assert observation.ahead is not None
+        assert observation.ahead.zone in (Zone.NONE, Zone.UNKNOWN), (number, observation.ahead.reason)
+
+
+@pytest.mark.parametrize(("side", "number"), [(Zone.RIGHT, 23), (Zone.LEFT, 18), (Zone.LEFT, 23)])
+def test_a_stone_whose_shadow_meets_the_foot_of_a_heap_adds_no_litres_to_it(side: Zone, number: int) -> None:
+    """The two are one lump of the map; the stone's own border tells it from the heap."""
+    loaded, angle_deg = (SceneZone.LEFT, 45.0) if side is Zone.RIGHT else (SceneZone.RIGHT, -45.0)
+    observation = judged(photograph(renderer(), "stone", side, loaded, angle_deg, number), angle_deg)
+    assert observation.zone in (Zone.CENTER, Zone(str(loaded)), Zone.UNKNOWN), observation.reason
+    assert observation.ahead is not None
+    assert observation.ahead.zone in (Zone(str(loaded)), Zone.UNKNOWN), observation.ahead.reason
+
+
+def plank_before_the_blade(s_m: float, d_m: float, half_m: tuple[float, float, float], azimuth_deg: float) -> Frame:
+    plank = Solid("box", (d_m, s_m, half_m[2]), half_m, (150, 120, 80), azimuth_deg)
     field = SoilField()
     state = SceneState(field.heights_m.astype(np.float32), field.cell_m, VEHICLE_X_M, BladePose(0.0), (plank,))
     color, depth = renderer().render(state, Appearance(ground="earth", disparity_noise_px=0.1))
-    frame = Frame(color, depth, renderer().color_intrinsics, renderer().depth_intrinsics, 0.0)
-    observation = judged(frame, 0.0)
+    return Frame(color, depth, renderer().color_intrinsics, renderer().depth_intrinsics, 0.0)
+
+
+@pytest.mark.parametrize(("s_m", "half_long_m"), [(0.0, 0.5), (0.33, 0.2), (-0.33, 0.2)])
+def test_a_plank_beyond_the_soils_zone_turns_no_blade(s_m: float, half_long_m: float) -> None:
+    """Flat on the ground it has no form that is not soil's; before the blade lay no pile, ahead of it was one."""
+    observation = judged(plank_before_the_blade(s_m, 0.49, (0.10, half_long_m, 0.03), 0.0), 0.0)
     assert observation.zone is Zone.NONE
     assert observation.ahead is not None
     assert observation.ahead.zone in (Zone.NONE, Zone.UNKNOWN)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_plank_whose_near_edge_is_seen_is_no_pile(side: float) -> None:
+    """Its edge is no higher than steep soil with noise on it may rise, but it is so all along."""
+    observation = judged(plank_before_the_blade(side * 0.31, 0.22, (0.085, 0.34, 0.026), side * 60.0), 0.0)
+    assert observation.zone in (Zone.NONE, Zone.UNKNOWN), observation.reason
+    assert observation.ahead is not None
+    assert observation.ahead.zone in (Zone.NONE, Zone.UNKNOWN), observation.ahead.reason
 
 
 def test_a_colour_method_sees_who_stands_there_too() -> None:
