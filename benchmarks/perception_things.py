@@ -4,7 +4,8 @@
     python -m benchmarks.perception_things --each 5       # fewer
 
 Every placement is judged on an empty bed, or with a heap in another third: what lies before the blade, and what the
-blade will meet. Bars: no thing alone is called a pile, and no heap on one side is answered with the thing's.
+blade will meet. Bars: no thing alone is called a pile, and no heap on one side is answered with the thing's. Of things
+as large as a third of the blade it is told, and no bar.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from graderd.perception.classifier import Classifier, make_classifier
 from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.piles import SceneZone
 from harness.perception_scenes import ON_GROUND
-from harness.perception_things import COLOR_SIZE, DEPTH_SIZE, KINDS, SIDES, photograph
+from harness.perception_things import COLOR_SIZE, DEPTH_SIZE, KINDS, LARGE, SIDES, photograph
 
 OPPOSITE = {Zone.LEFT: SceneZone.RIGHT, Zone.RIGHT: SceneZone.LEFT}
 
@@ -34,7 +35,7 @@ def sweep(each_n: int) -> list[tuple[str, Zone, SceneZone, float, SoilObservatio
         PerceptionSettings(method="depth"), CameraCalibration(), BladeGeometry(), live=False
     )
     found = []
-    for kind in KINDS:
+    for kind in (*KINDS, *LARGE):
         for side in SIDES:
             for number in range(each_n):
                 loaded = SceneZone.NONE
@@ -65,17 +66,19 @@ def main() -> int:
     options = parser.parse_args()
     cv2.setNumThreads(1)
     counts: Counter[tuple[str, str, str]] = Counter()
-    bad = 0
+    wrong_n = dict.fromkeys((KINDS, LARGE), 0)
     for kind, side, loaded, angle_deg, observation in sweep(options.each):
         counts[kind, "loaded" if loaded is not SceneZone.NONE else "empty", str(observation.zone)] += 1
         if problem := wrong(side, loaded, observation):
-            bad += 1
+            wrong_n[LARGE if kind in LARGE else KINDS] += 1
             print(f"{problem}: {kind} {side} at {angle_deg:+.0f} deg, soil {loaded}: {observation.zone} "
                   f"{observation.confidence * 100:.0f} %, {observation.reason}; ahead {observation.ahead}")  # fmt: skip
     for (kind, bed, zone), count in sorted(counts.items()):
         print(f"{kind:<8} {bed:<7} {zone:<8} {count}")
-    print(f"{sum(counts.values())} placements, {bad} wrong")
-    return 1 if bad else 0
+    for kinds, what in ((KINDS, "placements"), (LARGE, "of large things")):
+        placed_n = sum(count for (kind, _, _), count in counts.items() if kind in kinds)
+        print(f"{placed_n} {what}, {wrong_n[kinds]} wrong")
+    return 1 if wrong_n[KINDS] else 0
 
 
 if __name__ == "__main__":

@@ -15,7 +15,9 @@ from graderd.simulator.grader.piles import SceneZone, lay_scene
 from graderd.simulator.grader.soil import SoilField
 
 VEHICLE_X_M = 3.0
-KINDS = ("legs", "foliage", "pipe", "box", "crate", "stone", "boulder", "chest")
+KINDS = ("legs", "foliage", "pipe", "box", "crate", "stone")
+LARGE = ("boulder", "chest")
+"""As large as a third of the blade: the picture's edge or a heap may hide most of how they end."""
 SIDES = {Zone.LEFT: 1.0, Zone.CENTER: 0.0, Zone.RIGHT: -1.0}
 DISTANCE_M = {"legs": (0.14, 0.45), "boulder": (0.24, 0.42), "chest": (0.22, 0.42)}
 """How far ahead of the face: what is large lies further off, so as not to stand in the blade."""
@@ -62,7 +64,7 @@ def things(kind: str, s_m: float, d_m: float, angle_deg: float, rng: np.random.G
 
 def photograph(renderer: Renderer, kind: str, side: Zone, loaded: SceneZone, angle_deg: float, number: int) -> Frame:
     """A frame with the thing in ``side`` and soil as ``loaded`` says."""
-    rng = np.random.default_rng((number, KINDS.index(kind)))
+    rng = np.random.default_rng((number, (*KINDS, *LARGE).index(kind)))
     pose = BladePose(angle_deg)
     field = SoilField()
     if loaded is not SceneZone.NONE:
