@@ -832,7 +832,8 @@ class _Address:
             return NoDaemonError(
                 where,
                 "no daemon serves this socket",
-                "start it with 'graderd run' or 'systemctl start graderd', or name its socket with --socket",
+                "start it with 'graderd run' (without a machine: 'graderd run --sim') or 'systemctl start graderd', or "
+                "name its socket with --socket",
             )
         if isinstance(error, PermissionError):
             return NoDaemonError(where, "this user may not use the daemon's socket", "join its group (graderd)")

@@ -32,9 +32,10 @@ def tokens() -> Path:
 
 
 def own_socket() -> Path | None:
-    """The socket of a daemon that this user runs; None where the system gives users no such place."""
-    own = os.environ.get("XDG_RUNTIME_DIR")
-    return Path(own) / "graderd" / "graderd.sock" if own else None
+    """The socket of a daemon that this user runs: in ``$XDG_RUNTIME_DIR``, and where a session has none (``su``, a
+    container) where that daemon's state is; None where there is no such user."""
+    own = _of_the_user("XDG_RUNTIME_DIR", ".local/state")
+    return None if own is None else own / "graderd.sock"
 
 
 def _of_the_user(variable: str, under_home: str) -> Path | None:

@@ -82,7 +82,7 @@ def make_cli() -> typer.Typer:
             Path | None,
             typer.Option(
                 help="The daemon's socket. Default: $GRADERD_SOCKET, else what the configuration says, else "
-                "/run/graderd/graderd.sock, else $XDG_RUNTIME_DIR/graderd/graderd.sock.",
+                "/run/graderd/graderd.sock, else $XDG_RUNTIME_DIR/graderd/graderd.sock (without it ~/.local/state).",
             ),
         ] = None,
         version: Annotated[
@@ -132,10 +132,11 @@ def run_app(arguments: list[str]) -> int:
         return ExitCode.FAILED
     except BrokenPipeError:
         return ExitCode.FAILED
-    except OSError as error:  # a file or directory that this user may not use
+    except OSError as error:  # a file or directory that is not there, or that this user may not use
         if error.filename is None:  # nowhere to print to
             raise
-        print_error(str(error.filename), error.strerror or str(error), "Run it as a user who may use it", as_json)
+        remedy = "Run it as a user who may use it" if isinstance(error, PermissionError) else "Look at it, or name another"
+        print_error(str(error.filename), error.strerror or str(error), remedy, as_json)
         return ExitCode.FAILED
     if result == INTERRUPTED:
         raise KeyboardInterrupt

@@ -35,6 +35,8 @@ def register(app: typer.Typer) -> None:
 
         Only its hash is kept. The address that is printed beside it opens the operator page and logs it in.
         """
+        from graderd.api.settings import TcpSettings
+
         found = load_or_refuse(config, json)
         made = create_token(_file(found), name, right)
         address = _page(found)
@@ -45,7 +47,9 @@ def register(app: typer.Typer) -> None:
         if address:
             print_text(f"{address}/#{made}")
         else:
-            print_text("nobody listens on TCP: add a section [api.tcp] to the configuration and restart the daemon")
+            port = f"graderd config set api.tcp.port_n {TcpSettings().port_n}"
+            where = f" --config {config}" if config else ""
+            print_text(f"nobody listens on TCP yet: {port}{where}, then restart the daemon")
 
     @token.command("list", epilog=example("graderd token list"))
     def list_(config: File = None, json: Json = False) -> None:

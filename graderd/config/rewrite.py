@@ -40,7 +40,6 @@ _REMEDIES: Final[Mapping[int, str]] = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "Make room on its file system"),
     **dict.fromkeys((errno.EACCES, errno.EPERM), "Run it with sudo, or name another file with --config"),
     errno.EROFS: "Mount its file system writable",
-    errno.ENOENT: "Name another file with --config",
 }
 
 
@@ -89,7 +88,11 @@ def backups_of(path: Path) -> list[Path]:
     Raises:
         OSError: the directory cannot be read.
     """
-    return [path.with_name(name) for _, _, name in _dated(path.name, os.listdir(path.parent))]
+    try:
+        beside = os.listdir(path.parent)
+    except FileNotFoundError:
+        return []
+    return [path.with_name(name) for _, _, name in _dated(path.name, beside)]
 
 
 def _dated(name: str, beside: list[str]) -> list[tuple[str, int, str]]:
@@ -110,8 +113,8 @@ def check_rights(path: Path) -> None:
 
 
 def merged(text: str, changes: Mapping[str, Any]) -> str:
-    """The configuration ``text`` with ``changes`` (tables of tables) put in; comments and order stay. A key that stands
-    there as a comment with its default (``graderd config init``) takes that line, beneath its explanation.
+    """The configuration ``text`` with ``changes`` (tables of tables) put in; comments and order stay. A key or a table
+    that stands there as a comment (``graderd config init``) takes that line, beneath its explanation.
 
     Raises:
         ConfigError: the text is not TOML, or has a value where ``changes`` has a table.
@@ -125,6 +128,31 @@ def merged(text: str, changes: Mapping[str, Any]) -> str:
 
 
 _HEADER = re.compile(r"\s*\[([\w.]+)\]\s*(#.*)?")
+_COMMENTED_HEADER = re.compile(r"#\[([\w.]+)\]")
+_EXPLAINS = re.compile(r"#(?!\s?\w+(: not set| = ))")
+
+
+def _headers(lines: list[str], pattern: re.Pattern[str] = _HEADER) -> list[tuple[int, str]]:
+    """Where tables begin, and their names."""
+    return [(number, match[1]) for number, line in enumerate(lines) if (match := pattern.fullmatch(line))]
+
+
+def _begin(lines: list[str], table: str) -> None:
+    """A header for a table that has none: where it stands as a comment, else behind the tables beside it, before what
+    explains the next one. (tomlkit would put it below that explanation.) Where neither is there, tomlkit finds room."""
+    commented = [number for number, name in _headers(lines, _COMMENTED_HEADER) if name == table]
+    if commented:
+        lines[commented[0]] = f"[{table}]"
+        return
+    headers = _headers(lines)
+    parent, _, _ = table.rpartition(".")
+    beside = [number for number, name in headers if parent and f"{name}.".startswith(f"{parent}.")]
+    if not beside:
+        return
+    end = next((number for number, _ in headers if number > beside[-1]), len(lines))
+    while end < len(lines) and _EXPLAINS.match(lines[end - 1]):
+        end -= 1
+    lines[end:end] = [f"[{table}]", ""]
 
 
 def _with_room(text: str, changes: Mapping[str, Any]) -> str:
@@ -135,11 +163,15 @@ def _with_room(text: str, changes: Mapping[str, Any]) -> str:
     for table, key, value in _plain_keys(changes):
         if _has(present, (*table, key)):
             continue
-        headers = [(number, match[1]) for number, line in enumerate(lines) if (match := _HEADER.fullmatch(line))]
-        starts = [number for number, name in headers if name == ".".join(table)] if table else [-1]
+        name = ".".join(table)
+        if name and not _has(present, table) and all(found != name for _, found in _headers(lines)):
+            _begin(lines, name)
+        headers = _headers(lines)
+        starts = [number for number, found in headers if found == name] if name else [-1]
         if not starts:
             continue
-        end = next((number for number, _ in headers if number > starts[0]), len(lines))
+        bounds = [number for number, _ in headers + _headers(lines, _COMMENTED_HEADER)]
+        end = min((number for number in bounds if number > starts[0]), default=len(lines))
         commented = re.compile(rf"#\s?{re.escape(key)}(: not set| = .*)")
         places = [number for number in range(starts[0] + 1, end) if commented.fullmatch(lines[number])]
         written = f"{key} = {tomlkit.item(_value(value)).as_string()}"
@@ -383,6 +415,7 @@ def _told(path: Path) -> Iterator[None]:
         raise ConfigError(path, lines) from None
     except OSError as error:
         number = error.errno or 0
-        remedy = _REMEDIES.get(number, "Look at the file and its directory")
+        begin = f"Make it first: graderd config init {path}" if number == errno.ENOENT else ""
+        remedy = begin or _REMEDIES.get(number, "Look at the file and its directory")
         line = f"{path}: cannot be written ({error.strerror}); it is as it was. {remedy}"
         raise ConfigError(path, [line]) from None

@@ -12,7 +12,7 @@ import sys
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import tomlkit
 from pydantic import BaseModel
@@ -46,10 +46,15 @@ def sections(model: BaseModel, begun_with: dict[str, Any], path: tuple[str, ...]
     """The text of one table: its own keys first, then its sub-tables."""
     fields = type(model).model_fields
     tables = {name: getattr(model, name) for name in fields if isinstance(getattr(model, name), BaseModel)}
-    plain = {name: field for name, field in fields.items() if name not in tables}
+    absent = {
+        name: section
+        for name, field in fields.items()
+        if getattr(model, name) is None and (section := _by_defaults(field.annotation)) is not None
+    }
+    plain = {name: field for name, field in fields.items() if name not in tables and name not in absent}
     if path:
-        summary = (type(model).__doc__ or "").strip().splitlines()
-        yield "".join(f"# {line}\n" for line in textwrap.wrap(summary[0] if summary else "", 116))
+        summary = (type(model).__doc__ or "").split("\n\n")[0].replace("``", "`")
+        yield "".join(f"# {line}\n" for line in textwrap.wrap(" ".join(summary.split()), 116))
         # A table that is only whole with all its keys stands in comments with them.
         whole = any(field.is_required() for field in plain.values())
         yield f"{'#' if whole else ''}[{'.'.join(path)}]\n"
@@ -66,6 +71,16 @@ def sections(model: BaseModel, begun_with: dict[str, Any], path: tuple[str, ...]
     yield "\n"
     for name, value in tables.items():
         yield from sections(value, begun_with, (*path, name))
+    for name, value in absent.items():
+        yield re.sub(r"(?m)^(?=[^#\n])", "#", "".join(sections(value, begun_with, (*path, name))))
+
+
+def _by_defaults(annotation: Any) -> BaseModel | None:
+    """A section that is not there unless somebody asks for it, as its defaults make it; None where it has none."""
+    models = [each for each in get_args(annotation) if isinstance(each, type) and issubclass(each, BaseModel)]
+    if not models or any(field.is_required() for field in models[0].model_fields.values()):
+        return None
+    return models[0]()
 
 
 def _key(name: str, value: Any, *, active: bool) -> Iterator[str]:

@@ -252,6 +252,7 @@ class PerceptionSupervisor:
                 stdout=asyncio.subprocess.PIPE,
                 stderr=asyncio.subprocess.PIPE,
                 limit=MAX_LINE_BYTES,
+                process_group=0,  # Ctrl-C in a terminal is the daemon's, which ends it in its own order
             )
         )
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
@@ -260,6 +261,14 @@ async def test_cancelling_leaves_no_child(tmp_path: Path) -> None:
         await until(lambda: eyes.newest is not None)
         pid = int(starts(tmp_path)[-1].split('"pid": ')[1].split(",")[0])
     assert not Path(f"/proc/{pid}").exists()
+
+
+async def test_ctrl_c_in_a_terminal_is_not_the_childs(tmp_path: Path) -> None:
+    """It reaches every process of the terminal's group; the daemon alone answers it, and ends the child in order."""
+    async with worker(tmp_path, "opened()\nwhile True:\n    frame(); time.sleep(0.03)\n") as eyes:
+        await until(lambda: eyes.newest is not None)
+        pid = int(starts(tmp_path)[-1].split('"pid": ')[1].split(",")[0])
+        assert os.getpgid(pid) == pid
 
 
 async def test_what_a_failing_child_prints_goes_through_the_log(

@@ -10,6 +10,7 @@ import resource
 import signal
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -340,3 +341,38 @@ def test_a_key_takes_the_line_where_it_stood_as_a_comment() -> None:
     assert merged("[tilt]\nmin_mm = 4.0\n\n# of the rule\n[rule]\n", {"tilt": {"max_mm": 90.0}}) == (
         "[tilt]\nmax_mm = 90.0\nmin_mm = 4.0\n\n# of the rule\n[rule]\n"
     )
+
+
+def test_a_table_comes_where_it_stood_as_a_comment_or_beside_its_like() -> None:
+    """Never between another table's explanation and its header."""
+    before = template()
+    after = merged(before, {"api": {"tcp": {"port_n": 8000, "host": "::1"}}})
+    removed, added = (
+        [line[2:] for line in difflib.ndiff(before.splitlines(), after.splitlines()) if line.startswith(mark)]
+        for mark in ("- ", "+ ")
+    )
+    assert removed == ["#[api.tcp]", '#host = "127.0.0.1"', "#port_n = 8431"]
+    assert added == ["[api.tcp]", 'host = "::1"', "port_n = 8000"]
+
+    changes = {"api": {"tcp": {"port_n": 8000, "host": "::1"}}}
+    short = "[api]\n#socket = 'x'\n\n# what is\n# recorded\n[recording]\n"
+    assert merged(short, changes) == (
+        "[api]\n#socket = 'x'\n\n[api.tcp]\nhost = \"::1\"\nport_n = 8000\n\n# what is\n# recorded\n[recording]\n"
+    )
+    for text in ("", "[api]\n", "[api]\ntcp = { port_n = 1 }\n", "[api]\ntcp.port_n = 1\n", "[api.limits]\n"):
+        assert tomllib.loads(merged(text, changes))["api"]["tcp"] == {"port_n": 8000, "host": "::1"}, text
+
+
+def test_the_explanation_of_a_table_is_whole() -> None:
+    """A sentence and more, as the models have it: none ends in its middle."""
+    lines = template().splitlines()
+    ends = [lines[at - 1] for at, line in enumerate(lines) if re.fullmatch(r"#?\[[\w.]+\]", line)]
+    assert len(ends) > 20
+    assert [line for line in ends if not (line.startswith("# ") and line.endswith("."))] == []
+
+
+def test_where_there_is_no_file_yet_the_line_says_how_to_begin(tmp_path: Path) -> None:
+    path = tmp_path / "nowhere" / "graderd.toml"
+    for write in (lambda: rewrite(path, longer), lambda: check_rights(path)):
+        with pytest.raises(ConfigError, match=f"graderd config init {path}"):
+            write()

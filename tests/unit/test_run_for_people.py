@@ -31,6 +31,11 @@ def test_server_and_clients_agree_on_a_place_of_the_users(tmp_path: Path, monkey
     served = Path(served_at(config, None).api.socket)
     assert served == default_socket() == tmp_path / "graderd" / "graderd.sock"
     assert served.parent.stat().st_mode & 0o777 == 0o700
+    monkeypatch.delenv("XDG_RUNTIME_DIR")  # as after su, and in a container
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    served = Path(served_at(config, None).api.socket)
+    assert served == default_socket() == tmp_path / "home" / ".local" / "state" / "graderd" / "graderd.sock"
+    assert served.parent.stat().st_mode & 0o777 == 0o700
     (tmp_path / "run").mkdir()
     assert Path(served_at(config, None).api.socket) == tmp_path / "run" / "graderd.sock", (
         "the service's, where it is ours"

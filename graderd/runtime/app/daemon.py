@@ -84,7 +84,7 @@ def served_at(config: Config, socket: Path | None) -> Config:
             return config
         socket = own
         with contextlib.suppress(OSError):  # then the socket cannot be made, which says so
-            own.parent.mkdir(mode=0o700, exist_ok=True)
+            own.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     if socket is None:
         return config
     return config.model_copy(update={"api": config.api.model_copy(update={"socket": str(socket)})})

@@ -34,6 +34,7 @@ class LiveView:
                 *(sys.executable, "-P", "-m", MODULE, *self._words),
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.DEVNULL,
+                process_group=0,  # as perception's: Ctrl-C is the daemon's
             )
             try:
                 status = await process.wait()

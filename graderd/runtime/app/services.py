@@ -30,6 +30,10 @@ from graderd.runtime.step_response import analyse, render, step_samples
 
 SETTLE_S = 0.5
 _PREFIX = "calibration-"
+NO_DIRECTORY = (
+    "Make a configuration with 'graderd config init', whose recording.directory is set, or set it with 'graderd config "
+    "set recording.directory FOLDER'; then restart the daemon"
+)
 
 
 class StepArguments(Settings):
@@ -161,7 +165,7 @@ def _recording(config: Config, recorder: Recorder) -> dict[str, DeviceService]:
 
     def directory() -> str:
         if recorder.directory is None:
-            raise DeviceMissingError("recording", "the daemon has no directory for it", "Set recording.directory")
+            raise DeviceMissingError("recording", "the daemon has no directory for it", NO_DIRECTORY)
         return str(recorder.directory)
 
     async def mark(wanted: MarkArguments) -> dict[str, Any]:
