@@ -6,12 +6,15 @@ read below one root directory, so that a test gives it a machine of its own.
 
 from __future__ import annotations
 
+import grp
 import json
 import os
 import platform
+import pwd
 import re
 import shutil
 import socket
+import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -20,6 +23,8 @@ from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+
+from graderd import places
 
 if TYPE_CHECKING:
     from graderd.config import Config
@@ -33,6 +38,9 @@ for a third of a second, and what is said after them is refused."""
 FREE_LEAST_MB: Final = 500.0
 RUN_S: Final = 5.0
 USB3_MBIT_PER_S: Final = 5000
+FIRMWARE_REPAIR: Final = (
+    "end the daemon; rs-fw-update -f FILE.bin (librealsense's tool; firmware from Intel's page of D400 releases)"
+)
 
 
 class Verdict(StrEnum):
@@ -66,13 +74,15 @@ def run_command(*command: str) -> str | None:
 @dataclass(frozen=True)
 class Machine:
     """Where to look. ``root``: ``/``, or a test's own; ``run``: asks a program; ``status``: of the daemon that answers,
-    or None; ``service``: asks one of its services that only read."""
+    or None; ``service``: asks one of its services that only read; ``user``: who runs the daemon, and so needs the
+    rights (empty: who asks)."""
 
     config: Config
     root: Path = Path("/")
     run: Callable[..., str | None] = run_command
     status: Mapping[str, Any] | None = None
     service: Callable[[str], Mapping[str, Any]] | None = None
+    user: str = ""
 
     def at(self, path: str | Path) -> Path:
         """A path of the machine's."""
@@ -149,7 +159,15 @@ def _unit(machine: Machine) -> Iterator[Finding]:
 
 
 def _sockets(machine: Machine) -> Iterator[Finding]:
-    for path in (Path(machine.config.api.socket), Path(machine.config.api.socket).with_suffix(".stop")):
+    served = Path(machine.config.api.socket)
+    own = places.own_socket()
+    if own is not None and machine.status is None and "socket" not in machine.config.api.model_fields_set:
+        sockets = {served: "sudo systemctl restart graderd", own: "graderd run, which makes them anew"}
+    else:
+        sockets = {served: "sudo systemctl restart graderd"}
+    for path, repair in (
+        (path, repair) for base, repair in sockets.items() for path in (base, base.with_suffix(".stop"))
+    ):
         there = machine.at(path)
         if not there.exists():
             continue
@@ -163,7 +181,7 @@ def _sockets(machine: Machine) -> Iterator[Finding]:
                 )
             except OSError as error:
                 seen = f"{path}: left behind, nobody listens ({error.strerror or error})"
-                yield Finding("socket", Verdict.WARN, seen, "sudo systemctl restart graderd")
+                yield Finding("socket", Verdict.WARN, seen, repair)
             else:
                 yield Finding("socket", Verdict.PASS, f"{path}: a daemon listens")
 
@@ -175,12 +193,42 @@ def _rights(machine: Machine) -> Iterator[Finding]:
             yield Finding(
                 f"{name} port", Verdict.FAIL, f"{port} is not there", "plug it in; ls -l /dev/graderd /dev/serial"
             )
-        elif os.access(device, os.R_OK | os.W_OK):
-            yield Finding(f"{name} port", Verdict.PASS, f"{port} -> {os.path.realpath(device)}")
         else:
-            yield Finding(
-                f"{name} port", Verdict.FAIL, f"{port}: this user may not use it", "sudo usermod -aG dialout $USER"
-            )
+            yield _use_of(machine, f"{name} port", port, f"{port} -> {os.path.realpath(device)}")
+    if machine.config.camera.source == "realsense":
+        for camera in realsense_cameras(machine.root):
+            if machine.at(camera.node).exists():
+                yield _use_of(machine, "camera rights", camera.node, f"{camera.node}: {machine.user or 'this user'}")
+
+
+def _use_of(machine: Machine, check: str, path: str, seen: str) -> Finding:
+    """Whether who runs the daemon may read and write a device, and what makes it so."""
+    device = machine.at(path)
+    found = device.stat()
+    if not machine.user:
+        may = os.access(device, os.R_OK | os.W_OK)
+    else:
+        user = pwd.getpwnam(machine.user)
+        groups = os.getgrouplist(machine.user, user.pw_gid)
+        shift = 6 if found.st_uid == user.pw_uid else 3 if found.st_gid in groups else 0
+        may = user.pw_uid == 0 or (found.st_mode >> shift) & 0o6 == 0o6
+    if may:
+        return Finding(check, Verdict.PASS, seen)
+    by_group = stat.S_IMODE(found.st_mode) & 0o060 == 0o060 and found.st_gid != 0
+    after = "sudo systemctl restart graderd" if machine.user else "log in again"
+    repair = (
+        f"sudo usermod -aG {_group(found.st_gid)} {machine.user or '$USER'}; {after}"
+        if by_group
+        else f"its group has no right to it: ls -lL {path}; 70-graderd.rules of the package gives it: plug it in again"
+    )
+    return Finding(check, Verdict.FAIL, f"{path}: {machine.user or 'this user'} may not use it", repair)
+
+
+def _group(number: int) -> str:
+    try:
+        return grp.getgrgid(number).gr_name
+    except KeyError:
+        return str(number)
 
 
 def _ports(config: Config) -> dict[str, str]:
@@ -199,6 +247,8 @@ class UsbCamera:
     serial: str
     speed_mbit_per_s: str
     device_release: str
+    node: str
+    """The device file that the library opens."""
 
 
 def realsense_cameras(root: Path) -> list[UsbCamera]:
@@ -211,7 +261,13 @@ def realsense_cameras(root: Path) -> list[UsbCamera]:
             return ""
 
     return [
-        UsbCamera(*(told(device, name) for name in ("product", "serial", "speed", "bcdDevice")))
+        UsbCamera(
+            told(device, "product"),
+            told(device, "serial"),
+            told(device, "speed"),
+            told(device, "bcdDevice"),
+            f"/dev/bus/usb/{told(device, 'busnum').zfill(3)}/{told(device, 'devnum').zfill(3)}",
+        )
         for device in sorted((root / "sys/bus/usb/devices").glob("*"))
         if told(device, "idVendor") == CAMERA_VENDOR and "RealSense" in told(device, "product")
     ]
@@ -233,6 +289,15 @@ def _camera(machine: Machine) -> Iterator[Finding]:
             yield Finding("camera", Verdict.PASS, seen)
     if not found:
         yield Finding("camera", Verdict.FAIL, "no RealSense camera on USB", "plug it in; lsusb -d 8086:")
+    told = str((machine.status or {}).get("camera", {}).get("description", ""))
+    firmware = re.search(r"firmware [\d.]+(, older than [\d.]+)?", told)
+    if firmware is None:
+        why = "no daemon to ask" if machine.status is None else "the daemon has not read it"
+        yield Finding("camera firmware", Verdict.NOTE, f"{why}: it is read from the open camera")
+    elif firmware[1]:
+        yield Finding("camera firmware", Verdict.WARN, f"{firmware[0]}, which the library recommends", FIRMWARE_REPAIR)
+    else:
+        yield Finding("camera firmware", Verdict.PASS, firmware[0])
 
 
 def _serial(machine: Machine) -> Iterator[Finding]:

@@ -65,11 +65,12 @@ class RealSenseCamera:
         self._depths: deque[_Arrived] = deque(maxlen=KEPT_DEPTH_N)
         self._last_depth_s = 0.0
         self._description = f"RealSense {settings.serial_number}".strip()
+        self._firmware = ""
 
     @property
     def description(self) -> str:
-        """Model and serial number, once open."""
-        return self._description
+        """Model, serial number and firmware, once open."""
+        return f"{self._description}{self._firmware}"
 
     def open(self) -> None:
         """Find the camera, set what the settings say of both sensors, open colour and depth.
@@ -92,6 +93,7 @@ class RealSenseCamera:
             )
         self._device = device
         self._description = _describe(device)
+        self._firmware = _firmware(device)
         try:
             _set_options(color[0], self._color_options())
             if depth is not None:
@@ -383,6 +385,23 @@ def _describe(device: sdk.Rs) -> str:
         device.get_info(info) for info in (rs.camera_info.name, rs.camera_info.serial_number) if device.supports(info)
     ]
     return " ".join(parts)
+
+
+def _firmware(device: sdk.Rs) -> str:
+    """Its version, and whether the library would have a newer one; empty where the device does not say."""
+    info = sdk.load().camera_info
+    if not device.supports(info.firmware_version):
+        return ""
+    told = device.get_info(info.firmware_version)
+    wanted = (
+        device.get_info(info.recommended_firmware_version) if device.supports(info.recommended_firmware_version) else ""
+    )
+    older = wanted and _numbers(told) < _numbers(wanted)
+    return f", firmware {told}" + (f", older than {wanted}" if older else "")
+
+
+def _numbers(version: str) -> list[int]:
+    return [int(part) for part in version.split(".") if part.isdigit()]
 
 
 def _frame_settings(frame: sdk.Rs) -> dict[str, float]:

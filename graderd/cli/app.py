@@ -135,7 +135,9 @@ def run_app(arguments: list[str]) -> int:
     except OSError as error:  # a file or directory that is not there, or that this user may not use
         if error.filename is None:  # nowhere to print to
             raise
-        remedy = "Run it as a user who may use it" if isinstance(error, PermissionError) else "Look at it, or name another"
+        remedy = (
+            "Run it as a user who may use it" if isinstance(error, PermissionError) else "Look at it, or name another"
+        )
         print_error(str(error.filename), error.strerror or str(error), remedy, as_json)
         return ExitCode.FAILED
     if result == INTERRUPTED:

@@ -196,7 +196,7 @@ class _Talk:
         status: dict[str, Any] = self._client.get("/v1/status")
         if status["mode"] != self._mode:
             cause = f"graderd became {status['mode']} meanwhile ({status['reason']}); nothing was changed"
-            raise CliError(WHERE, cause, "Do it again when nobody else uses it")
+            raise CliError(WHERE, cause, "Do it again when that is put right and nobody else uses it")
         return status
 
     def _still_deg(self) -> float:

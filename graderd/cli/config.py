@@ -104,13 +104,11 @@ def _changing(config: typer.Typer) -> None:
         Written where 'graderd run' of the same user reads it; what a user's own daemon keeps goes to
         ~/.local/state/graderd. A file that is there is left as it is.
         """
-        from graderd.config import template
+        from graderd.config.template import begin
 
         path = file or places.config()
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with path.open("x", encoding="utf-8") as made:
-                made.write(template.template(places.state_of(path)))
+            begin(path)
         except FileExistsError:
             remedy = "change it with 'graderd config set', or name another file"
             raise CliError(str(path), "there is such a file", remedy) from None

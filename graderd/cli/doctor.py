@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import pwd
 import sys
 import tarfile
 import time
@@ -26,6 +27,7 @@ from graderd.cli.console import (
     print_table,
     print_text,
 )
+from graderd.cli.setup_daemon import SERVICE_USER
 from graderd.client import ClientError
 from graderd.hal.text import printable
 
@@ -104,7 +106,17 @@ def _examine(context: typer.Context, path: Path | None) -> list[Finding]:
     def service(name: str) -> Mapping[str, Any]:
         return client.service(name, SERVICE_S)
 
-    return examine(Machine(config, status=status, service=service if status is not None else None), refusals)
+    asked = service if status is not None else None
+    return examine(Machine(config, status=status, service=asked, user=_daemons_user(path)), refusals)
+
+
+def _daemons_user(path: Path | None) -> str:
+    """Who runs the daemon of this configuration: the service's user for the machine's, else who asks (empty)."""
+    try:
+        pwd.getpwnam(SERVICE_USER)
+    except KeyError:
+        return ""
+    return SERVICE_USER if (path or places.config()) == places.CONFIG else ""
 
 
 def _configuration(path: Path | None) -> tuple[Config, list[str]]:

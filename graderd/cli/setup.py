@@ -162,14 +162,13 @@ def _wires(rig_dir: Path | None, path: Path) -> Wires:
 
 def _begin_file(path: Path) -> None:
     """A file to change, with every key explained, where there is none."""
-    from graderd.config.template import template
+    from graderd.config.template import begin
 
     if path.exists():
-        print_text(f"{path}: is there, and is gone on with")
+        print_text(f"{path}: is there already; setup goes on with it")
         return
     try:
-        with path.open("x", encoding="utf-8") as made:
-            made.write(template(places.state_of(path)))
+        begin(path)
     except OSError as error:
         cause = f"cannot be made ({error.strerror})"
         raise CliError(str(path), cause, "Run it with sudo, or name another with --config") from None

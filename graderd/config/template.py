@@ -123,5 +123,17 @@ def template(state: Path = places.STATE) -> str:
     return text
 
 
+def begin(path: Path) -> None:
+    """Write a file to begin with where none is, in a folder that may be new.
+
+    Raises:
+        FileExistsError: there is one; it is left as it is.
+        OSError: it cannot be made.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("x", encoding="utf-8") as made:
+        made.write(template(places.state_of(path)))
+
+
 if __name__ == "__main__":
     Path(sys.argv[1]).write_text(template(), encoding="utf-8")

@@ -96,6 +96,26 @@ def test_colour_and_depth_of_the_same_moment(camera: RealSenseCamera, soft: Soft
     assert frames[0].color_intrinsics.width == 320
 
 
+@pytest.mark.parametrize(
+    ("told", "says"),
+    [
+        ("5.13.0.50", "firmware 5.13.0.50, older than 5.16.0.1"),
+        ("5.16.0.1", "firmware 5.16.0.1"),
+        ("5.17.0.9", "firmware 5.17.0.9"),
+    ],
+)
+def test_the_firmware_is_told_and_whether_the_library_would_have_a_newer_one(
+    soft: SoftD455, told: str, says: str
+) -> None:
+    info = sdk.load().camera_info
+    soft.device.register_info(info.firmware_version, told)
+    soft.device.register_info(info.recommended_firmware_version, "5.16.0.1")
+    camera = RealSenseCamera(settings(), lambda: [soft.device])
+    camera.open()
+    assert camera.description == f"Intel RealSense D455 SYN0001, {says}"
+    camera.close()
+
+
 def test_a_slow_reader_gets_the_newest(camera: RealSenseCamera, soft: SoftD455) -> None:
     push = both(soft)
     for number in range(1, 20):

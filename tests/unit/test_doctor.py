@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import grp
 import json
+import os
+import socket
 import tarfile
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,6 +31,7 @@ STATUS: dict[str, Any] = {
         "rotation": {"name": "rotation", "measured_age_s": 0.02, "counters": {"requests_n": 1000, "timeouts_n": 1}}
     },
     "faults": [],
+    "camera": {"description": "Intel RealSense D455 0123, firmware 5.16.0.1"},
 }
 UNIT = "LoadState=loaded\nActiveState=active\nUnitFileState=enabled\nNRestarts=0\nResult=success\n"
 
@@ -44,6 +49,10 @@ class Bench:
         self.write("/sys/bus/usb/devices/2-1/product", "Intel(R) RealSense(TM) Depth Camera 455")
         self.write("/sys/bus/usb/devices/2-1/speed", "5000")
         self.write("/sys/bus/usb/devices/2-1/bcdDevice", "5015")
+        self.write("/sys/bus/usb/devices/2-1/busnum", "2")
+        self.write("/sys/bus/usb/devices/2-1/devnum", "7")
+        self.write("/dev/bus/usb/002/007", "")
+        self.user = ""
         self.write("/dev/ttyUSB0", "")
         self.write("/sys/class/tty/ttyUSB0/device/latency_timer", "1")
         self.write("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "performance")
@@ -69,6 +78,7 @@ class Bench:
             self.run,
             self.status,
             lambda _: {"differences": self.differences},
+            self.user,
         )
         return examine(machine, refusals or [])
 
@@ -113,6 +123,18 @@ def status(path: str, value: Any) -> Callable[[Bench], None]:
         for step in way:
             target = target[step]
         target[last] = value
+
+    return change
+
+
+def rights(path: str, mode: int) -> Callable[[Bench], None]:
+    """A device that the service's user, who is nobody here, may use no more than ``mode`` says."""
+
+    def change(bench: Bench) -> None:
+        bench.user = "nobody"
+        (bench.root / path).chmod(mode)
+        if os.geteuid() == 0:  # whose files else have a group that is nobody's to join
+            os.chown(bench.root / path, 0, grp.getgrnam("daemon").gr_gid)
 
     return change
 
@@ -163,6 +185,16 @@ BROKEN: tuple[tuple[str, Callable[[Bench], object], str, Verdict, str], ...] = (
     ("late tick", status("tick.lateness_p99_ms", 25.0), "daemon", Verdict.WARN, "governor"),
     ("lost replies", status("axes.rotation.counters.timeouts_n", 90), "dead times", Verdict.WARN, "termination"),
     ("never measured", status("axes.rotation.measured_age_s", None), "dead times", Verdict.WARN, "power it"),
+    (
+        "old firmware",
+        status("camera.description", "Intel RealSense D455 0123, firmware 5.13.0.50, older than 5.16.0.1"),
+        "camera firmware",
+        Verdict.WARN,
+        "rs-fw-update",
+    ),
+    ("group", rights("dev/ttyUSB0", 0o660), "rotation port", Verdict.FAIL, " nobody; sudo systemctl restart graderd"),
+    ("no group", rights("dev/ttyUSB0", 0o600), "rotation port", Verdict.FAIL, "ls -lL /dev/graderd/servo"),
+    ("USB", rights("dev/bus/usb/002/007", 0o660), "camera rights", Verdict.FAIL, "sudo usermod -aG "),
     ("a fault", status("faults", [FAULT]), "fault", Verdict.FAIL, "look at the cable"),
 )
 
@@ -184,6 +216,31 @@ def test_two_actuators_on_one_address_are_found(bench: Bench) -> None:
     found = bench.found("addresses", config=config.model_copy(update={"lift_right": lift}))
     assert found.verdict is Verdict.FAIL
     assert "lift_left and lift_right have address 19" in found.seen
+
+
+def test_a_disk_with_too_little_room_is_found(bench: Bench) -> None:
+    recording = Config().recording.model_copy(update={"directory": "/var/lib/graderd/recordings", "min_free_mb": 1e9})
+    found = bench.found("disk", config=Config().model_copy(update={"recording": recording}))
+    assert found.verdict is Verdict.FAIL
+    assert "du -xh /var/lib/graderd/recordings" in found.repair
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("whose", ["the service's", "the user's own"])
+def test_a_socket_that_a_killed_daemon_left_is_found(whose: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with tempfile.TemporaryDirectory(prefix="g-") as short:  # a socket's path has 107 bytes at most
+        bench = Bench(Path(short))
+        bench.status = None
+        monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/7")
+        assert bench.found("socket").verdict is Verdict.PASS
+        path = bench.root / ("run/graderd" if whose == "the service's" else "run/user/7/graderd") / "graderd.sock"
+        path.parent.mkdir(parents=True)
+        with socket.socket(socket.AF_UNIX) as gone:
+            gone.bind(str(path))
+        found = bench.found("socket")
+        assert found.verdict is Verdict.WARN
+        assert "nobody listens" in found.seen
+        assert ("systemctl restart graderd" if whose == "the service's" else "graderd run") in found.repair
 
 
 def test_what_the_configuration_check_refuses_is_told(bench: Bench) -> None:

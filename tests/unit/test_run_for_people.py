@@ -17,6 +17,7 @@ from graderd.cli.app import run_app
 from graderd.client import Client, default_socket
 from graderd.config import Config, load
 from graderd.runtime.app.daemon import served_at
+from graderd.wires import MachineWires
 
 
 def test_server_and_clients_agree_on_a_place_of_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,3 +108,24 @@ def test_an_ordinary_users_configuration_is_made_where_his_daemon_reads_it(
     places.CONFIG.unlink()
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     assert places.config() == places.CONFIG, "what root makes is the machine's"
+
+
+def test_a_new_users_setup_begins_with_a_file_where_his_daemon_reads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In a home where nothing is yet, and without a machine: it comes as far as looking for the adapter."""
+    monkeypatch.setattr(places, "CONFIG", tmp_path / "etc" / "graderd.toml")
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(MachineWires, "serial_ports", lambda _: {})
+    monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("GRADERD_SOCKET", str(tmp_path / "nobody.sock"))
+    (tmp_path / "answers").write_text("")
+    assert run_app(["setup", "--answers", str(tmp_path / "answers")]) == 1
+    own = tmp_path / ".config" / "graderd" / "graderd.toml"
+    said = capsys.readouterr()
+    assert said.out.startswith(f"{own}: made, with every key")
+    assert "adapter" in said.err
+    assert load().state.directory == str(places.state_of(own))
+    assert run_app(["setup", "--answers", str(tmp_path / "answers")]) == 1
+    assert capsys.readouterr().out.startswith(f"{own}: is there already")
