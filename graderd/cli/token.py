@@ -35,7 +35,7 @@ def register(app: typer.Typer) -> None:
 
         Only its hash is kept. The address that is printed beside it opens the operator page and logs it in.
         """
-        from graderd.api.settings import TcpSettings
+        from graderd.config import Config
 
         found = load_or_refuse(config, json)
         made = create_token(_file(found), name, right)
@@ -47,7 +47,9 @@ def register(app: typer.Typer) -> None:
         if address:
             print_text(f"{address}/#{made}")
         else:
-            port = f"graderd config set api.tcp.port_n {TcpSettings().port_n}"
+            usual = Config.model_validate({"api": {"tcp": {}}}).api.tcp
+            assert usual is not None
+            port = f"graderd config set api.tcp.port_n {usual.port_n}"
             where = f" --config {config}" if config else ""
             print_text(f"nobody listens on TCP yet: {port}{where}, then restart the daemon")
 
