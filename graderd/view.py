@@ -7,7 +7,7 @@ first where there is no room.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
 from graderd.hal.text import printable
@@ -25,6 +25,7 @@ UNSEEN: Final = "?"
 TALL_MM: Final = 100.0
 """A profile's bars are as tall as its highest, which is told beside them; one lower than this looks low."""
 MARK: Final = "…"
+LEAST_REASON_N: Final = 12
 STYLES: Final[Mapping[Kind, str]] = {
     "title": "bold",
     "fault": "bold red",
@@ -38,24 +39,35 @@ STYLES: Final[Mapping[Kind, str]] = {
 
 @dataclass(frozen=True)
 class Line:
-    """One line. ``weight``: what has less goes first where there is no room; 0 stays."""
+    """One line. ``weight``: what has less goes first where there is no room; 0 stays. ``goes_on``: its sentence ends in
+    the next one."""
 
     text: str
     kind: Kind = "plain"
     weight: int = field(default=0, compare=False)
+    goes_on: bool = field(default=False, compare=False)
 
 
 def lines(status: Status, columns_n: int, lines_n: int) -> list[Line]:
     """The status in so much room."""
     found = [*_head(status), *_faults(status, columns_n), *_axes(status, columns_n), *_soil(status), *_rest(status)]
-    found = [Line(fitting(printable(line.text), columns_n), line.kind, line.weight) for line in found]
-    while len(found) > lines_n and any(line.weight for line in found):
-        heaviest = max(line.weight for line in found)
-        found.remove(next(line for line in reversed(found) if line.weight == heaviest))
+    found = [replace(line, text=fitting(printable(line.text), columns_n)) for line in found]
+    for weight in sorted({line.weight for line in found if line.weight}, reverse=True):
+        for place in reversed([place for place, line in enumerate(found) if line.weight == weight]):
+            if len(found) > lines_n:
+                _leave_out(found, place, columns_n)
     if len(found) > lines_n:
         left_out = len(found) - lines_n + 1
         found = [*found[: lines_n - 1], Line(f"{MARK} {left_out} more lines: graderd status --json", "warn")]
     return found
+
+
+def _leave_out(found: list[Line], place: int, columns_n: int) -> None:
+    """Take a line out; the sentence that it ends says by a mark that it goes on."""
+    gone = found.pop(place)
+    before = found[place - 1] if place else None
+    if before is not None and before.goes_on:
+        found[place - 1] = replace(before, text=fitting(f"{before.text} {gone.text.strip()}", columns_n), goes_on=False)
 
 
 def fitting(text: str, columns_n: int) -> str:
@@ -111,17 +123,24 @@ def _faults(status: Status, columns_n: int) -> Iterator[Line]:
         over = "" if fault["present"] else " (over)"
         kind: Kind = "fault" if fault["reaction"] in BADLY else "warn"
         yield Line(f"! {fault['name']}{over}, {fault['reaction']}: {fault['reads']}", kind)
-        yield from (Line(f"  > {part}", kind, 1) for part in _wrapped(fault["remedy"], columns_n - 4, 2))
+        parts = _wrapped(fault["remedy"], columns_n - 4, 2)
+        for number_n, part in enumerate(parts, start=1):
+            yield Line(f"{'  >' if number_n == 1 else '   '} {part}", kind, 1, goes_on=number_n < len(parts))
         if fault["detail"]:
             yield Line(f"    {fault['detail']}", kind, 5)
     if not status["faults"]:
         yield Line("no faults", "dim", 3)
+    told = {fault["name"] for fault in status["faults"]}
     for need in status["readiness"]:
-        if not need["met"]:
-            what = "not ready" if need["mandatory"] else "missing"
-            yield Line(
-                f"{what}: {need['name']}, {need['reason']} > {need['remedy']}", "warn", 1 if need["mandatory"] else 4
-            )
+        if not need["met"] and need["name"] not in told:
+            yield Line(_unmet(need, columns_n), "warn", 1 if need["mandatory"] else 4)
+
+
+def _unmet(need: Mapping[str, Any], columns_n: int) -> str:
+    """A requirement in one line: where there is no room for both, the reason gives way to the remedy."""
+    begin, end = f"{'not ready' if need['mandatory'] else 'missing'}: {need['name']}", f" > {need['remedy']}"
+    room_n = columns_n - len(begin) - len(", ") - len(end)
+    return f"{begin}, {fitting(need['reason'], room_n)}{end}" if room_n >= LEAST_REASON_N else f"{begin}{end}"
 
 
 def _wrapped(text: str, columns_n: int, lines_n: int) -> list[str]:

@@ -14,8 +14,12 @@ from graderd.hal.errors import DeviceError
 from graderd.simulator.control_client import rig_request
 from graderd.simulator.grader.piles import SceneZone
 
-PLUGS: Final = {"servo": ("servo", "servo_fault"), "can": ("actuators", "actuator_fault")}
-"""By adapter: the rig's part, and the command that takes its faults."""
+PLUGS: Final = {
+    "servo": ("servo", "servo_fault"),
+    "can": ("actuators", "actuator_fault"),
+    "camera": ("camera", "camera_fault"),
+}
+"""By plug: the rig's part, and the command that takes its faults."""
 
 
 HAND_DEG: Final = 0.4
@@ -43,9 +47,9 @@ def _request(given: dict[str, Any]) -> dict[str, Any]:
         case "press" | "release":
             return {"command": "stop_loop", "state": "open" if given["cmd"] == "press" else "closed"}
         case "unplug":
-            return {"command": PLUGS[given["adapter"]][1], "name": "unplug"}
+            return {"command": PLUGS[given["what"]][1], "name": "unplug"}
         case "plug":
-            return {"command": "clear_faults", "part": PLUGS[given["adapter"]][0]}
+            return {"command": "clear_faults", "part": PLUGS[given["what"]][0]}
     return {"command": given.pop("cmd"), **given}
 
 
@@ -65,8 +69,8 @@ def main(arguments: list[str] | None = None) -> int:
     turn.add_argument("angle_deg", type=float)
     commands.add_parser("press", help="press the button in the stop loop")
     commands.add_parser("release", help="release it")
-    for name, what in (("unplug", "pull an adapter's plug"), ("plug", "plug it in again")):
-        commands.add_parser(name, help=what).add_argument("adapter", choices=list(PLUGS))
+    for name, what in (("unplug", "pull a plug: an adapter's, or the camera's"), ("plug", "plug it in again")):
+        commands.add_parser(name, help=what).add_argument("what", choices=list(PLUGS))
     given = vars(parser.parse_args(arguments))
     try:
         if given["cmd"] == "turn":

@@ -94,6 +94,42 @@ def test_it_fits_faults_first_and_no_number_is_cut(columns_n: int, lines_n: int,
     assert not re.search(r"\d…", shown(found)), "a number with its end cut off is another number"
 
 
+@pytest.mark.parametrize(("columns_n", "lines_n"), SIZES)
+@pytest.mark.parametrize("faults_n", [1, 3, 5])
+def test_no_remedy_ends_in_its_middle_without_a_mark(columns_n: int, lines_n: int, faults_n: int) -> None:
+    remedy = "plug it in again, in any port; it is found by its serial number, whichever that is, and then arm again"
+    status = status_of(faults_n, 0)
+    for number, told in enumerate(status["faults"]):
+        told |= {"name": f"rotation.not_moving_{number}", "remedy": remedy, "detail": ""}
+    text = [line.text for line in lines(status, columns_n, lines_n - 3)]
+    begins = [place for place, line in enumerate(text) if line.startswith("  > ")]
+    assert begins
+    for place in begins:
+        goes_on = [line for line in text[place + 1 : place + 2] if line.startswith("    ")]
+        said = " ".join([text[place].removeprefix("  > "), *(line.strip() for line in goes_on)])
+        assert said == remedy or (said.endswith("…") and remedy.startswith(said[:-1]))
+
+
+@pytest.mark.parametrize(("columns_n", "lines_n"), SIZES)
+def test_a_long_reason_leaves_the_remedy_its_room(columns_n: int, lines_n: int) -> None:
+    """A machine that was stopped before its start says why at length, and then what to do."""
+    status = status_of(0, 1)
+    status["readiness"][0] |= {
+        "name": "stop",
+        "reason": "stopped: a loop that nobody has read " * 5,
+        "remedy": "reset it",
+    }
+    text = [line.text for line in lines(status, columns_n, lines_n - 3)]
+    (unmet,) = (line for line in text if line.startswith("not ready: stop, stopped: "))
+    assert unmet.endswith("… > reset it")
+
+
+def test_what_a_fault_says_already_is_not_said_again() -> None:
+    status = status_of(1, 1)
+    status["readiness"][0]["name"] = status["faults"][0]["name"]
+    assert "not ready" not in shown(lines(status, 80, 40))
+
+
 def test_the_profile_is_bars_with_its_highest_as_a_number() -> None:
     bars = "left ?··▁▁▂▂▂▃▃▄▄▄▅▅▅▆▆▇▇▇███ right, 210 mm high"
     assert f"  profile  {bars}" in shown(lines(status_of(0), 60, 20)).split("\n")
