@@ -7,6 +7,7 @@ import json
 import logging
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,17 @@ def test_every_command_has_help_with_an_example_and_json(words: list[str]) -> No
     talks = (["calibrate", "lifts"], ["calibrate", "rotation"], ["setup"], ["watch"])
     told_otherwise = words in (["can", "database"], *talks)
     assert told_otherwise or "--json" in result.output or "JSON" in result.output
+
+
+def test_the_manual_page_names_every_command() -> None:
+    """By its first word; and each of those that a group has, where the page lists any of them."""
+    page = (Path(__file__).parents[2] / "packaging" / "graderd.1").read_text(encoding="utf-8")
+    items = [line.removeprefix(".It").split() for line in page.splitlines() if line.startswith(".It Cm ")]
+    named = {word: item for item in items for mark, word in pairwise(item) if mark == "Cm"}
+    for words in leaf_commands():
+        assert words[0] in named, f"{words[0]} is not in the manual page"
+        listed = named[words[0]] if "|" in named[words[0]] and len(words) > 1 else words
+        assert words[-1] in listed, f"{' '.join(words)} is not in the manual page"
 
 
 def test_all_commands_of_the_issue_are_there() -> None:
