@@ -16,7 +16,7 @@ def config() -> Path:
     """The configuration that is meant where none is named: the machine's, and on a computer without one the user's own
     (``$XDG_CONFIG_HOME``). Root has none of its own: what root writes is the machine's."""
     own = _of_the_user("XDG_CONFIG_HOME", ".config")
-    return CONFIG if own is None or os.geteuid() == 0 or _is_there(CONFIG) else own / CONFIG.name
+    return CONFIG if own is None or os.geteuid() == 0 or is_there(CONFIG) else own / CONFIG.name
 
 
 def state_of(config_path: Path) -> Path:
@@ -46,8 +46,8 @@ def _of_the_user(variable: str, under_home: str) -> Path | None:
     return base / "graderd" if base.is_absolute() else None
 
 
-def _is_there(path: Path) -> bool:
-    """Also where this user may not look: there is one then, and it is not for us to run without it."""
+def is_there(path: Path) -> bool:
+    """Whether it is; also where this user may not look: there is one then, and it is not for us to do without it."""
     try:
         path.stat()
     except (FileNotFoundError, NotADirectoryError):

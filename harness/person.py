@@ -107,6 +107,11 @@ class Person:
             pass
         return self.process.wait(max(0.1, give_up_s - time.monotonic()))
 
+    def hang_up(self) -> None:
+        """Close the terminal, as an SSH connection that broke does."""
+        os.close(self._master)
+        self._master = -1
+
     def freeze(self) -> None:
         """Halt the command where it is."""
         self.process.send_signal(signal.SIGSTOP)

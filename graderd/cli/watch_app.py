@@ -8,10 +8,14 @@ is halted all end the motion, at the latest when the lease lapses, 0.3 s after i
 from __future__ import annotations
 
 import asyncio
+import os
+import select
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
 from typing import Any, ClassVar, Final
 
 from rich.text import Text
@@ -20,6 +24,7 @@ from textual.app import App, ComposeResult
 from textual.binding import BindingType
 from textual.widgets import Static
 
+from graderd.cli.console import ExitCode
 from graderd.cli.dead_man import HeldKey
 from graderd.cli.gamepad import Pad, Stick
 from graderd.client import AsyncClient, AsyncLease, ClientError
@@ -97,6 +102,8 @@ class WatchApp(App[None]):
         self.run_worker(self._listen(), group="listen")
         self.set_interval(LOOK_S, self._look)
         self.set_interval(RENEW_S, self._draw)
+        if sys.__stdin__ is not None and sys.__stdin__.isatty():
+            Thread(target=_end_with, args=(sys.__stdin__.fileno(),), name="terminal", daemon=True).start()
         if self._pad is not None:
             self.say(self._pad.open())
 
@@ -234,6 +241,18 @@ class WatchApp(App[None]):
             age_s = time.monotonic() - self._heard_s
             return [Line(f"LAST HEARD {age_s:.1f} s AGO", "stop"), Line("nothing on this screen is known", "warn")]
         return lines(self._status, columns_n, lines_n)
+
+
+def _end_with(terminal: int) -> None:
+    """End this process when its terminal hangs up: nobody sees the screen any more, and a pad is no hand without it.
+
+    A signal tells that to those alone whose session it ends (not below su or sudo). In a thread, and without a word, as
+    the loop may hang in what it still had to write.
+    """
+    hung_up = select.poll()
+    hung_up.register(terminal, 0)
+    hung_up.poll()
+    os._exit(ExitCode.FAILED)
 
 
 def _ends_deg(config: dict[str, Any]) -> dict[bool, float]:

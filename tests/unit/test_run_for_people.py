@@ -41,6 +41,12 @@ def test_server_and_clients_agree_on_a_place_of_the_users(tmp_path: Path, monkey
     assert Path(served_at(config, None).api.socket) == tmp_path / "run" / "graderd.sock", (
         "the service's, where it is ours"
     )
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert Path(served_at(config, None).api.socket) != tmp_path / "run" / "graderd.sock", "where it is not"
+    (tmp_path / "run" / "graderd.sock").touch()
+    assert Path(served_at(config, None).api.socket) == tmp_path / "run" / "graderd.sock" == default_socket(), (
+        "but not beside the service, which the clients would talk to"
+    )
 
 
 def test_a_socket_that_is_named_counts_more_than_any_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

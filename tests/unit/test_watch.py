@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import os
 import re
+import shlex
 import signal
 import sys
 import time
@@ -328,6 +329,19 @@ async def test_a_frozen_session_stops_the_blade(tmp_path: Path, what: str) -> No
             assert daemon.state.mode is Mode.MANUAL
             person.type(" ", enter=False)  # and the stop key still works
             await daemon.until_mode(Mode.STOPPED)
+
+
+@pytest.mark.live
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+async def test_it_ends_with_its_terminal_though_no_signal_tells_it(tmp_path: Path) -> None:
+    """As below su or sudo, whose session it is that ends: nothing is left that streams, or holds a pad's lease."""
+    async with serving(tmp_path) as (_, path):
+        words = shlex.join([sys.executable, "-m", "graderd", "--socket", str(path), "watch"])
+        with Person(["sh", "-c", f"trap '' HUP; exec {words}"], dict(os.environ)) as person:
+            await asyncio.to_thread(person.expect, "rotation", 60.0)
+            person.hang_up()
+            await asyncio.to_thread(person.process.wait, 30.0)
 
 
 def test_without_the_extra_one_line_names_the_remedy(

@@ -76,11 +76,11 @@ def run_daemon(
 
 def served_at(config: Config, socket: Path | None) -> Config:
     """The configuration with the socket that is asked for; where nobody names one and the service's place is not ours,
-    a place of this user's, which the clients know."""
+    a place of this user's, which the clients know. Not beside the service, which is what they would talk to."""
     own = places.own_socket()
     service = Path(config.api.socket)
     if socket is None and own is not None and "socket" not in config.api.model_fields_set:
-        if os.access(service.parent, os.W_OK):
+        if os.access(service.parent, os.W_OK) or places.is_there(service):
             return config
         socket = own
         with contextlib.suppress(OSError):  # then the socket cannot be made, which says so
