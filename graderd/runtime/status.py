@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from importlib.metadata import version
@@ -33,6 +34,7 @@ from graderd.hal.linear_actuator import ActuatorTelemetry
 from graderd.hal.reading import Reading
 from graderd.hal.rotator import RotatorTelemetry
 from graderd.hal.vehicle import VehicleTelemetry
+from graderd.perception.settings import DecisionSettings
 from graderd.runtime.control import ControlLoop
 from graderd.runtime.perception_supervisor import PerceptionSupervisor
 
@@ -61,7 +63,7 @@ def build_status(
         holding=state.holding,
         last_stop=str(loop.last_stop) if loop.last_stop else "",
         stop_n=state.stop_n,
-        soil=_soil(tick.soil, eyes.frames_per_s, now_s),
+        soil=_soil(tick.soil, eyes.frames_per_s, now_s, config.perception.decision),
         decision=DecisionStatus(
             zone=decision.zone,
             angle_deg=decision.angle_deg,
@@ -112,9 +114,20 @@ def _requirement(told: Requirement) -> RequirementStatus:
     return RequirementStatus(**told._asdict())
 
 
-def _soil(newest: SoilObservation | None, frames_per_s: float, now_s: float) -> SoilStatus:
+def _soil(newest: SoilObservation | None, frames_per_s: float, now_s: float, settings: DecisionSettings) -> SoilStatus:
+    """How much lies where is told as long as picture and blade angle are good, also where it is no clear zone."""
     if newest is None:
         return SoilStatus()
+    if newest.faults or newest.blade_angle_age_s > settings.max_angle_age_s:
+        newest = replace(
+            newest,
+            volume_left_l=None,
+            volume_center_l=None,
+            volume_right_l=None,
+            ahead=None,
+            carried=None,
+            profile_mm=None,
+        )
     return SoilStatus(
         zone=newest.zone,
         confidence=newest.confidence,

@@ -8,13 +8,14 @@ import os
 import socket
 import time
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 
 from graderd.config import Config, parse
 from graderd.core.machine import Mode
-from graderd.core.soil import Zone
+from graderd.core.soil import PictureFault, SoilAhead, Thirds, Zone
 from graderd.core.status import CameraStatus, Status
 from graderd.hal.clock import ManualClock
 from graderd.hal.device import Lifecycle
@@ -284,6 +285,32 @@ async def test_what_is_past_its_age_is_told_as_unknown(tmp_path: Path) -> None:
     attitude, tilt = told.attitude, told.axes["tilt"]
     assert (attitude.height_mm, attitude.lifts_age_s, attitude.pitch_deg, attitude.pitch_age_s) == (None,) * 4
     assert (tilt.flags, tilt.thermal_load) == (None, None)
+
+
+@pytest.mark.parametrize("doubt", ["none", "picture", "angle"])
+async def test_where_how_much_lies_is_told_only_by_a_good_picture_at_a_known_angle(tmp_path: Path, doubt: str) -> None:
+    """The observation keeps its numbers, not believed; for people they are none."""
+    thirds = Thirds(3.0, 2.0, 1.0)
+    doubts: dict[str, dict[str, Any]] = {
+        "picture": {"faults": (PictureFault("obstructed", "a post"),)},
+        "angle": {"blade_angle_age_s": 5.1},
+        "none": {},
+    }
+    bench = Bench(tmp_path)
+    await bench.ticks(
+        3,
+        zone=Zone.UNKNOWN,
+        volume_left_l=3.0,
+        ahead=SoilAhead(Zone.UNKNOWN, 0.0, "no clear zone", thirds),
+        carried=thirds,
+        profile_mm=(12.5,) * 24,
+        **doubts[doubt],
+    )
+    told = build_status(Config(), bench.loop, _Eyes()).soil  # type: ignore[arg-type]  # all that is asked of it
+    assert told.zone is Zone.UNKNOWN
+    numbers = (told.volume_left_l, told.ahead, told.carried, told.profile_mm)
+    assert (numbers == (None,) * 4) == (doubt != "none")
+    assert (None in numbers) == (doubt != "none")
 
 
 class NoBus(FakeLink):
