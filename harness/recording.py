@@ -17,8 +17,9 @@ from typing import Any
 from graderd.config import parse
 from graderd.core.tick import Controller, Sensed
 from graderd.hal.reading import Reading
+from graderd.record import FramesWanted
 from graderd.record.files import RecordingFile
-from graderd.record.layout import TICK, FramesWanted, Memory, memory_of
+from graderd.record.layout import TICK, Memory, memory_of
 from graderd.record.reader import Recording, said
 from graderd.record.recorder import FLUSH_S, MEMORY_EVERY_S, Item, Recorder, Step, Translator, head_of
 from harness.stretch import SETTINGS, TICK_S, stretch_of_work

@@ -7,6 +7,7 @@ import json
 import os
 import time
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from graderd.hal.errors import DeviceError
 from graderd.simulator.camera import faults as camera_faults
-from graderd.simulator.camera.appearance import Appearance, BladeMaterial, GroundKind, Share, SoilKind
+from graderd.simulator.camera.appearance import Appearance, BladeMaterial, GroundKind, SoilKind
 from graderd.simulator.camera.child import CameraChild
 from graderd.simulator.camera.renderer import CAMERA_HEIGHT_M, top_depth, top_view
 from graderd.simulator.grader.machine import Machine
@@ -110,10 +111,10 @@ class ControlServer:
                 world.reset_vehicle()
             case Light():
                 changes = command.model_dump(exclude={"cmd"}, exclude_none=True)
-                appearance = Appearance(**{**self._appearance.model_dump(), **changes})
-                await self._camera.tell({"appearance": appearance.model_dump()})
+                appearance = replace(self._appearance, **changes)
+                await self._camera.tell({"appearance": asdict(appearance)})
                 self._appearance = appearance
-                return {"ok": True, "light": appearance.model_dump()}
+                return {"ok": True, "light": asdict(appearance)}
             case CameraFault():
                 params = camera_faults.parameters(command.name, command.params)
                 await self._camera.tell({"fault": command.name, "params": params})
@@ -205,6 +206,7 @@ def _write_png(path: str, picture: np.ndarray) -> None:
 
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 Params = dict[str, Number]
 
 
@@ -256,20 +258,20 @@ class Light(_Command):
     """Change light, soil, blade or camera noise; what is not named stays."""
 
     cmd: Literal["light"]
-    sun_azimuth_deg: Number | None = None
-    sun_elevation_deg: Number | None = None
-    sun_strength: Number | None = None
-    ambient: Number | None = None
-    red_cast: Number | None = None
-    exposure: Number | None = None
+    sun_azimuth_deg: Number | None = Field(None, ge=-360, le=360)
+    sun_elevation_deg: Number | None = Field(None, ge=5, le=90)
+    sun_strength: Number | None = Field(None, ge=0, le=4)
+    ambient: Number | None = Field(None, ge=0, le=2)
+    red_cast: Number | None = Field(None, ge=-0.5, le=0.5)
+    exposure: Number | None = Field(None, gt=0, le=8)
     shadows: bool | None = None
     machine_shadow: Share | None = None
     soil: SoilKind | None = None
     wetness: Share | None = None
     blade: BladeMaterial | None = None
     ground: GroundKind | None = None
-    color_noise: Number | None = None
-    disparity_noise_px: Number | None = None
+    color_noise: Number | None = Field(None, ge=0, le=30)
+    disparity_noise_px: Number | None = Field(None, ge=0, le=1)
     hole_share: Share | None = None
 
 

@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -177,7 +178,7 @@ def _make(number: int) -> dict[str, Any]:
 
 def _row(name: str, scene: RandomScene, seeds: tuple[int, int]) -> dict[str, Any]:
     error_deg = float(np.random.default_rng((*seeds, 2)).normal(0.0, _ANGLE_ERROR_DEG))
-    appearance = {key: _short(value) for key, value in scene.appearance.model_dump().items()}
+    appearance = {key: _short(value) for key, value in asdict(scene.appearance).items()}
     left, center, right = scene.volumes_l
     return {
         "id": name,

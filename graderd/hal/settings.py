@@ -25,9 +25,10 @@ PROFILE_MARGIN = 1.2
 
 
 class Settings(BaseModel):
-    """Base of all settings: frozen, strict about unknown keys, defaults checked too."""
+    """Base of all settings: frozen, strict about unknown keys, defaults checked too. A section's own validator is built
+    when that section is first made alone: none of a process that reads no configuration, and none twice."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, defer_build=True)
 
 
 _PLUGIN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")

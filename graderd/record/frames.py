@@ -21,6 +21,7 @@ import numpy as np
 from graderd.core.attitude import MeasuredAttitude
 from graderd.core.soil import SoilObservation
 from graderd.hal.camera import ColorImage, DepthImage, Frame
+from graderd.record import FramesWanted
 from graderd.record.files import RecordingFile
 from graderd.record.layout import (
     COLOR,
@@ -30,7 +31,6 @@ from graderd.record.layout import (
     FRAMES_SUFFIX,
     MARK,
     FrameRecord,
-    FramesWanted,
     Mark,
     Message,
     frame_bytes,
@@ -73,13 +73,21 @@ class FrameRecorder:
         self._thread = threading.Thread(target=self._work, name="frame-recorder", daemon=True)
         self._thread.start()
 
-    def take(self, judged: Judged) -> None:
-        """One more frame was judged."""
+    def take(
+        self,
+        frame: Frame,
+        angle_deg: float,
+        angle_age_s: float,
+        attitude: MeasuredAttitude,
+        judged_s: float,
+        observation: SoilObservation,
+    ) -> None:
+        """One more frame was judged; all as in :class:`Judged`."""
         self._seen_n += 1
         if self._seen_n % self.wanted.every_n:
             return
         try:
-            self._frames.put_nowait(judged)
+            self._frames.put_nowait(Judged(frame, angle_deg, angle_age_s, attitude, judged_s, observation))
         except queue.Full:
             self._lost_n += 1
 

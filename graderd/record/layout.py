@@ -196,18 +196,6 @@ class Memory(BaseModel):
     controller: bytes
 
 
-class FramesWanted(BaseModel):
-    """What perception is to record of raw frames: one of ``every_n`` to ``path``, or beside it where that is taken; an
-    empty path: none. ``head`` and ``config_json`` as in every recording."""
-
-    model_config = ConfigDict(frozen=True)
-
-    path: str = ""
-    every_n: int = 1
-    head: dict[str, str] = {}
-    config_json: str = "{}"
-
-
 @dataclass(frozen=True, slots=True)
 class FrameRecord:
     """One raw picture of ``/camera/color`` and ``/camera/depth``, with everything it was judged by and what came of it.

@@ -34,6 +34,7 @@ from graderd.core.status import RecordingStatus
 from graderd.core.tick import Controller, Sensed, Tick, TickSettings
 from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.reading import Reading
+from graderd.record import FramesWanted
 from graderd.record.files import RecordingFile
 from graderd.record.layout import (
     CHANNELS,
@@ -47,7 +48,6 @@ from graderd.record.layout import (
     SUFFIX,
     TICK,
     WIRE,
-    FramesWanted,
     Mark,
     Memory,
     Message,

@@ -19,7 +19,7 @@ from graderd.core.blade import BladeGeometry
 from graderd.core.soil import PROFILE_BINS_N, SoilObservation
 from graderd.hal.settings import AnyCameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
-from graderd.record.layout import FramesWanted
+from graderd.record import FramesWanted
 
 _OBSERVATION: TypeAdapter[SoilObservation] = TypeAdapter(SoilObservation)
 

@@ -28,7 +28,7 @@ from graderd.hal.fault import DeviceFault, PresentFaults
 from graderd.hal.reading import Reading
 from graderd.hal.settings import CameraSettings
 from graderd.perception.settings import CameraCalibration, PerceptionSettings
-from graderd.record.layout import FramesWanted
+from graderd.record import FramesWanted
 from graderd.runtime.perception_protocol import (
     Angle,
     CameraProblem,

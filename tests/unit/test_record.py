@@ -33,7 +33,7 @@ from graderd.core.soil import SoilObservation, Zone
 from graderd.core.tick import Controller, Sensed, Tick
 from graderd.hal.camera import Frame, Intrinsics
 from graderd.hal.reading import Reading
-from graderd.record import layout
+from graderd.record import FramesWanted, layout
 from graderd.record import recorder as recorder_module
 from graderd.record.export import export, raw_frames
 from graderd.record.files import RecordingFile
@@ -49,7 +49,6 @@ from graderd.record.layout import (
     TICK,
     TRANSFORM,
     WIRE,
-    FramesWanted,
     Mark,
     Memory,
     controller_of,
@@ -696,7 +695,7 @@ def test_raw_frames_read_back_as_they_were_judged(tmp_path: Path) -> None:
     recorder = FrameRecorder(FramesWanted(path=str(path), every_n=2, head={"version": "t"}, config_json=config))
     given = [judged(number) for number in range(7)]
     for one in given:
-        recorder.take(one)
+        recorder.take(*one)
     recorder.end()
     recorder.join(10.0)
     found = [one for _, one in raw_frames(Recording(path))]

@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import cv2
 import numpy as np
@@ -30,8 +30,7 @@ from graderd.hal.errors import DeviceError, DeviceTimeoutError
 from graderd.hal.settings import DEPTH_PRESETS, CameraSettings
 from graderd.perception.classifier import Classifier, judge_frame, make_classifier
 from graderd.perception.frame_set import Entry, FrameSetWriter, with_lens_of
-from graderd.record.frames import FrameRecorder, Judged
-from graderd.record.layout import FramesWanted
+from graderd.record import FramesWanted
 from graderd.runtime.app.frame_sources import open_camera
 from graderd.runtime.perception_protocol import (
     Angle,
@@ -46,6 +45,9 @@ from graderd.runtime.perception_protocol import (
     Start,
     ToChild,
 )
+
+if TYPE_CHECKING:
+    from graderd.record.frames import FrameRecorder
 
 JPEG_QUALITY = 80
 OpenSource = Callable[[CameraSettings], Camera]
@@ -163,7 +165,7 @@ class Worker:
             )
             self._send(Observed.of(observation))
             if (recorder := self._recorder) is not None:
-                recorder.take(Judged(frame, angle_deg, age_s, attitude, judged_s, observation))
+                recorder.take(frame, angle_deg, age_s, attitude, judged_s, observation)
             if not self._to_save.empty():
                 self._save(self._to_save.get(), frame, attitude)
             while not self._formats.empty():
@@ -179,6 +181,9 @@ class Worker:
         if former is not None:
             former.end()
         if wanted.path:
+            # Loaded late: it brings the whole of a recording with it, half of what a child takes to start.
+            from graderd.record.frames import FrameRecorder
+
             self._recorder = FrameRecorder(wanted)
 
     def _save(self, wanted: SaveFrame, frame: Frame, attitude: MeasuredAttitude) -> None:
