@@ -164,12 +164,14 @@ class VirtualElectrak:
             self._last_activity_s = now_s
             if self._awake:
                 self._wake(now_s)
+        stood = not self._motor.busy
         while self._now_s < now_s:
-            step_s = min(_STEP_S, now_s - self._now_s)
-            if not self._motor.busy:
-                step_s = now_s - self._now_s
+            step_s = now_s - self._now_s
+            if not stood:
+                step_s = min(_STEP_S, step_s)
             self._now_s += step_s
             self._move(self._now_s, step_s)
+            stood = self._motor.rests or not self._motor.busy
         self._talk(now_s)
         out, self._out = self._out, []
         if self.faults.silent:

@@ -114,6 +114,14 @@ class Motor:
         )  # fmt: skip
 
     @property
+    def rests(self) -> bool:
+        """Whether it stood through the last step, as it does through any further one until it is told something else."""
+        return not (
+            self.state.direction or self.velocity_mm_per_s or self.current_a or self.manual_override
+            or self._faults.drift_mm_per_s or self.state.over_limit_since_s is not None
+        )  # fmt: skip
+
+    @property
     def saturated(self) -> bool:
         """Within a tenth of what it can do."""
         return self.current_a >= 0.9 * self.figures.current_full_load_a and self.state.direction != 0
