@@ -27,6 +27,8 @@ PICTURES = """\
 rate_hz = 6.0
 color_width_px = 320
 color_height_px = 200
+depth_width_px = 424
+depth_height_px = 240
 """
 """Few and small pictures: nobody here looks at them but perception, which sees soil in them all the same."""
 

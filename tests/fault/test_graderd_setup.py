@@ -36,12 +36,12 @@ from harness.set_up import (
     to_the_end,
     wires,
 )
-from tests.machine import PATIENT
+from tests.machine import PATIENT, PICTURES
 
 PATIENCE = {
     "recording": {"directory": ""},
     "stop_input": {"stale_s": 1.0},
-    "camera": {"rate_hz": 6.0, "stale_s": 3.0, "restart_s": 20.0},
+    "camera": {**tomllib.loads(PICTURES)["camera"], "stale_s": 3.0, "restart_s": 20.0},
     "perception": {"decision": {"max_frame_age_s": 1.0}},
     "rule": {"vote_max_age_s": 5.0},
 }
