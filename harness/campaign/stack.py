@@ -66,8 +66,9 @@ pitch_deg = -8.0
 backend = "simulated"
 stale_s = 1.0
 """
-"""Ten small pictures a second keep a loaded machine free for what is measured: they take a third of full ones' time; the presets move all axes.
-The stop input is the rig's, which shares the machine with everything else: it is given more time than a real one."""
+"""Ten pictures a second, small ones, keep a loaded machine free for what is measured: they take a third of the time of
+full ones. The presets move all axes. The stop input is the rig's, which shares the machine with everything else: it is
+given more time than a real one."""
 
 
 class CampaignError(Exception):

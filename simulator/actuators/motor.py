@@ -115,7 +115,7 @@ class Motor:
 
     @property
     def rests(self) -> bool:
-        """Whether it stood through the last step, as it does through any further one until it is told something else."""
+        """Whether it stood through the last step, as it does through any further one until it is told otherwise."""
         return not (
             self.state.direction or self.velocity_mm_per_s or self.current_a or self.manual_override
             or self._faults.drift_mm_per_s or self.state.over_limit_since_s is not None
