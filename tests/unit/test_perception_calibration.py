@@ -12,7 +12,7 @@ from graderd.core.attitude import MeasuredAttitude
 from graderd.core.blade import BladeGeometry
 from graderd.core.soil import Zone
 from graderd.hal.camera import Frame
-from graderd.perception import CameraCalibration
+from graderd.perception import CameraCalibration, PerceptionSettings
 from graderd.perception.annotate import calibration_picture
 from graderd.perception.calibration import (
     GEOMETRY,
@@ -23,6 +23,7 @@ from graderd.perception.calibration import (
     calibrate,
     with_pose,
 )
+from graderd.perception.classifier import make_classifier
 from graderd.perception.settings import StreamCalibration
 from graderd.simulator.camera.appearance import Appearance
 from graderd.simulator.camera.ground import SceneState
@@ -30,6 +31,7 @@ from graderd.simulator.camera.optics import knocked
 from graderd.simulator.camera.renderer import Renderer
 from graderd.simulator.grader.blade import BladePose
 from graderd.simulator.grader.soil import SoilField
+from harness.empty_blades import empty_blades
 from harness.perception_scenes import ON_GROUND, Scene, render
 
 pytestmark = pytest.mark.slow
@@ -180,6 +182,15 @@ def test_a_raised_blade_does_not_become_a_taller_one(up_mm: float, measured: boo
         frame = render(scene, NOMINAL, color_size=(640, 400), depth_size=(424, 240))
         views.append(EmptyBlade(frame, angle, attitude))
     assert calibrate(views, NOMINAL, BladeGeometry()).blade.height_m == pytest.approx(0.25, abs=0.005)
+
+
+def test_a_leaning_blade_becomes_no_lower_one_and_its_bed_is_empty() -> None:
+    """Of all of ``benchmarks/calibration.py`` the one whose height comes out worst."""
+    views = empty_blades(up_mm=0.0, lean_deg=10.0)
+    found = calibrate(views, NOMINAL, BladeGeometry())
+    assert found.blade.height_m == pytest.approx(0.25, abs=0.005)
+    judge = make_classifier(PerceptionSettings(), found.calibration, found.blade, live=False)
+    assert judge.classify(views[2].frame, views[2].blade_angle_deg, 0.0, views[2].attitude).zone is Zone.NONE
 
 
 def test_a_blade_far_off_its_drawing_is_refused() -> None:

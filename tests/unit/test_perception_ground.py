@@ -42,9 +42,18 @@ def crown(_x: F64, y: F64) -> F64:
     return np.asarray(-0.05 * np.abs(y), dtype=np.float64)
 
 
+def grass(x: F64, y: F64) -> F64:
+    """Tufts up to 20 mm high, some 4 cm apart."""
+    field = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(400, 400)), (0, 0), 2)
+    field = 0.020 * np.clip(0.5 + field / field.std() / 3.0, 0.0, 1.0)
+    i, j = ((x - X0) / CELL_M).astype(int), ((y - Y0) / CELL_M).astype(int)
+    return np.asarray(field[i, j], dtype=np.float64)
+
+
 GROUNDS: dict[str, Shape] = {
     "bowl": bowl,
     "crown": crown,
+    "grass": grass,
     "waves 8 mm": waves(0.008, 1),
     "waves 15 mm": waves(0.015, 2),
     "12 % up": lambda x, _y: 0.12 * x,
