@@ -33,8 +33,6 @@ socket = "{socket}"
 rate_hz = 8.0
 color_width_px = 640
 color_height_px = 400
-depth_width_px = 424
-depth_height_px = 240
 stale_s = 1.5
 restart_s = 15.0
 [perception.decision]
