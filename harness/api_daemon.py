@@ -106,7 +106,7 @@ class FakeDaemon:
     )
 
     def __post_init__(self) -> None:
-        self.waiting: list[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = []
+        self.waiting: list[tuple[cmd.Command, float, asyncio.Future[cmd.Reply]]] = []
         self._clock = AwakeClock()
         self._ticked = asyncio.Event()
         self._moving: set[str] = set()
@@ -137,9 +137,9 @@ class FakeDaemon:
         self._status = self._make_status(self._clock.now_s())
         return reply
 
-    async def command(self, command: cmd.Command) -> cmd.Reply:
+    async def command(self, command: cmd.Command, waited_s: float = 0.0) -> cmd.Reply:
         future: asyncio.Future[cmd.Reply] = asyncio.get_running_loop().create_future()
-        self.waiting.append((command, future))
+        self.waiting.append((command, self._clock.now_s() - waited_s, future))
         return await future
 
     def config(self) -> dict[str, Any]:
@@ -187,21 +187,23 @@ class FakeDaemon:
         taken = [] if self.frozen else sorted(self.waiting, key=lambda entry: not isinstance(entry[0], cmd.Stop))
         if taken:
             self.waiting = []
-        replies = self._step([command for command, _ in taken])
+        now_s = self._clock.now_s()
+        replies = self._step([command for command, _, _ in taken], tuple(now_s - at_s for _, at_s, _ in taken))
         self._move()
         self._status = self._make_status(now_s)
         self._ticked.set()
         self._ticked = asyncio.Event()
-        for (_, future), reply in zip(taken, replies, strict=True):
+        for (_, _, future), reply in zip(taken, replies, strict=True):
             if not future.done():
                 future.set_result(reply)
 
-    def _step(self, commands: list[cmd.Command]) -> tuple[cmd.Reply, ...]:
+    def _step(self, commands: list[cmd.Command], waited_s: tuple[float, ...] = ()) -> tuple[cmd.Reply, ...]:
         self.seen += commands
         inputs = Inputs(
             now_s=self._clock.now_s(),
             resolve=self._resolve,
             commands=tuple(commands),
+            waited_s=waited_s,
             pose=self._pose(),
             settled=not self._moving and not any(isinstance(command, cmd.Preset) for command in commands),
             devices_active=self._active,

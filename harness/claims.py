@@ -18,6 +18,7 @@ MACHINE: Final = "tests/unit/test_core_machine.py::"
 TICK: Final = "tests/unit/test_core_tick.py::"
 PARTS: Final = "tests/unit/test_runtime_parts.py::"
 MODEL: Final = "tests/unit/test_core_machine_model.py::"
+HTTP: Final = "tests/unit/test_api_http.py::"
 STOP: Final = "tests/unit/test_api_stop.py::"
 SOCKETS: Final = "tests/unit/test_api_sockets.py::"
 MANEUVER: Final = "tests/unit/test_runtime_maneuver.py::"
@@ -125,6 +126,14 @@ CLAIMS: Final = (
         "what a client sent before its stop is done after it",
     ),
     Mutant(
+        "F1-overtakes-requests",
+        "graderd/api/server.py",
+        "                stops.overtake()\n",
+        "                pass\n",
+        (STOP + "test_a_stop_sent_ahead_of_the_answer_to_another_request_waits_for_none",),
+        "a stop waits for the answer to the request before it",
+    ),
+    Mutant(
         "F1-torque-read-twice",
         "drivers/dynamixel/observer.py",
         '        if bool(health["torque_enable"]) is not self.torque_on:\n',
@@ -171,6 +180,30 @@ CLAIMS: Final = (
         "        finally:\n            pass\n",
         (SOCKETS + "test_the_lease_is_given_back_when_the_client_goes",),
         "a jog goes on for a lease after its client has gone",
+    ),
+    Mutant(
+        "F3-heard",
+        "graderd/core/machine.py",
+        "        command, heard_s = inputs.commands[n], inputs.now_s - (*inputs.waited_s[n : n + 1], 0.0)[0]\n",
+        "        command, heard_s = inputs.commands[n], inputs.now_s\n",
+        (MACHINE + "test_a_lease_counts_from_when_its_client_was_heard",),
+        "renewals that wait their turn move the blade for seconds after their client has gone",
+    ),
+    Mutant(
+        "F3-waits-with-its-time",
+        "graderd/api/sockets.py",
+        "self._by, asked.heard_s)",
+        "self._by, asyncio.get_running_loop().time())",
+        (SOCKETS + "test_a_command_counts_from_when_it_was_heard",),
+        "what waits on the jog socket counts from when its turn comes",
+    ),
+    Mutant(
+        "F3-sent-ahead",
+        "graderd/api/http_routes.py",
+        "        if isinstance(command, Jog | Preset | Renew) and getattr(request.state, SENT_AHEAD, False):\n",
+        "        if False:\n",
+        (HTTP + "test_nothing_moves_for_what_was_sent_ahead_of_the_answers",),
+        "renewals sent ahead of their answers move the blade for seconds after their client has gone",
     ),
     Mutant(
         "F3-own-name",
@@ -384,6 +417,14 @@ CLAIMS: Final = (
         "a maneuver turns the blade on by itself when a hold is over",
     ),
     Mutant(
+        "F13-armed-anew",
+        "graderd/runtime/maneuver.py",
+        "        if (armed_by := self._loop.armed_by) != CLIENT:\n",
+        "        if (armed_by := self._loop.armed_by) and False:\n",
+        (MANEUVER + "test_what_another_has_ended_and_armed_again_is_anothers",),
+        "a maneuver that was stopped goes on once somebody has armed the machine again",
+    ),
+    Mutant(
         "F13-retreat",
         "graderd/core/machine.py",
         "    if fault is not None and fault.row.reaction is Reaction.RETREAT and state.mode is Mode.AUTO:\n",
@@ -508,8 +549,8 @@ CLAIMS: Final = (
     Mutant(
         "I4-queue-void",
         "graderd/runtime/control.py",
-        "        while self._queue:\n",
-        "        while False:\n",
+        "        while self._queue:\n            queued =",
+        "        while False:\n            queued =",
         (CONTROL + "test_what_was_asked_before_a_stop_is_void",),
         "a reset sent before a stop undoes it",
     ),
@@ -681,8 +722,8 @@ CLAIMS: Final = (
     Mutant(
         "I17-validity",
         "graderd/runtime/status.py",
-        "        if reading is not None and reading.is_fresh(now_s, valid_for_s):\n",
-        "        if reading is not None:\n",
+        "(age_s := reading.age_if_fresh_s(now_s, valid_for_s)) is not None:\n",
+        "(age_s := reading.age_s(now_s)) is not None:\n",
         (PARTS + "test_what_is_past_its_age_is_told_as_unknown",),
         "old readings are told as if they were new",
     ),

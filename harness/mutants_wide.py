@@ -25,8 +25,8 @@ RUNTIME: Final = (
     Mutant(
         "stop-keeps-queue",
         "graderd/runtime/control.py",
-        "        while self._queue:\n",
-        "        while self._queue and not command.reason:\n",
+        "        while self._queue:\n            queued =",
+        "        while self._queue and not command.reason:\n            queued =",
         (CONTROL + "test_what_was_asked_before_a_stop_is_void",),
         "what was asked before a stop is carried out after it",
     ),

@@ -13,13 +13,15 @@ HEAD_MAX_BYTES = 8192
 """Request line and headers."""
 LINE_BYTES = 256
 """So much of a request is kept to know its first line by, should the rest of its head not be valid."""
+SENT_AHEAD = "sent_ahead"
+"""Known of a connection whose client does not wait for its answers (HTTP calls it pipelining)."""
 VERSIONS = (b"1.0", b"1.1")
 
 
 class JudgedConnection(h11.Connection):
     """h11's parser, which gives nobody a request whose head was not judged. ``line``: how the newest request begins,
-    as it came. ``known``: what is known of whoever sent the newest, its ``grant``; the application gets it as the
-    request's state."""
+    as it came. ``known``: what is known of whoever sent the newest, its ``grant`` and whether it was
+    :data:`SENT_AHEAD`; the application gets it as the request's state."""
 
     def __init__(self, guard: TcpGuard | None) -> None:
         super().__init__(h11.SERVER, HEAD_MAX_BYTES)

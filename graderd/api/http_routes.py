@@ -13,12 +13,14 @@ from fastapi import APIRouter, Body, Path, Query, Request, Response
 from pydantic import BaseModel, Field, StrictBool, create_model
 from starlette.requests import HTTPConnection
 
+from graderd.api.http_head import SENT_AHEAD
+from graderd.api.limiter import HEARD_S
 from graderd.api.port import DaemonPort, ServiceError
 from graderd.api.problem import Problem, ProblemError
 from graderd.api.settings import ApiLimits
 from graderd.api.stop import StopLane
 from graderd.api.tcp_guard import Grant
-from graderd.core.commands import AnyCommand, Command, Release, Renew, Reply, Stop
+from graderd.core.commands import AnyCommand, Command, Jog, Preset, Release, Renew, Reply, Stop
 from graderd.core.status import Status
 from graderd.hal.device import DeviceService
 from graderd.hal.text import printable
@@ -122,11 +124,15 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: 
         """The reply comes after the control tick that took the command.
 
         A jog or preset moves only while its lease is renewed (`renew`, at least every 0.3 s, 0.1 s advised) on the
-        connection that asked for it: the daemon names connections, and `client` is only what people read. The
+        connection that asked for it: the daemon names connections, and `client` is only what people read. Nothing
+        moves for requests sent before the last one was answered (pipelining): they would count when they are read. The
         WebSocket `/v1/jog` does that too, and gives the lease back at once when the connection ends.
         """
+        if isinstance(command, Jog | Preset | Renew) and getattr(request.state, SENT_AHEAD, False):
+            remedy = "wait for each answer, or use the WebSocket"
+            raise ProblemError(409, "sent ahead of the answers on its connection", command.command, remedy)
         asked = command.model_copy(update={"client": names.of(command.client, request)})
-        return accepted(await obey(port, asked, limits, asker_of(request)))
+        return accepted(await obey(port, asked, limits, asker_of(request), request.scope[HEARD_S]))
 
     @router.post("/stop", tags=["commands"], summary="End motion at once", openapi_extra=STOP_BODY)
     async def stop(request: Request) -> Reply:
@@ -276,9 +282,9 @@ def asker_of(connection: HTTPConnection) -> str:
     return f"{grant.name if grant else 'nobody'} at {connection.client.host if connection.client else '-'}"
 
 
-async def obey(port: DaemonPort, command: Command, limits: ApiLimits, by: str) -> Reply:
+async def obey(port: DaemonPort, command: Command, limits: ApiLimits, by: str, heard_s: float) -> Reply:
     """Hand a command over and wait for its reply, not for ever. What was asked, ``by`` whom, and what came of it goes
-    into the log; keeping a lease does not.
+    into the log; keeping a lease does not. ``heard_s``: when it came, by the event loop's clock.
 
     Raises:
         ProblemError: 504, the control tick did not answer.
@@ -286,7 +292,7 @@ async def obey(port: DaemonPort, command: Command, limits: ApiLimits, by: str) -
     if isinstance(command, Stop):
         reply = port.stop(command)
     else:
-        reply = await _answered(port, command, limits)
+        reply = await _answered(port, command, limits, heard_s)
     if not isinstance(command, Renew | Release):
         what = f"refused: {reply.message}" if not reply.accepted else reply.message
         log.info("%s by %s (%s): %s", _words(command), command.client, by, what, extra={"client": command.client})
@@ -298,10 +304,11 @@ def _words(command: Command) -> str:
     return " ".join((command.command, *(f"{name}={value}" for name, value in given.items())))
 
 
-async def _answered(port: DaemonPort, command: Command, limits: ApiLimits) -> Reply:
+async def _answered(port: DaemonPort, command: Command, limits: ApiLimits, heard_s: float) -> Reply:
+    waited_s = asyncio.get_running_loop().time() - heard_s
     try:
         async with asyncio.timeout(limits.command_timeout_s):
-            return await port.command(command)
+            return await port.command(command, waited_s)
     except TimeoutError as error:
         raise ProblemError(
             504,

@@ -60,6 +60,8 @@ COMMANDS_PATH = "/v1/commands"
 SERVICES_PREFIX = "/v1/services/"
 READ_AT_MOST = 4
 """A command that is so many times larger than allowed is looked at for a stop, and no further."""
+HEARD_S = "graderd.heard_s"
+"""When a request had come whole, by the event loop's clock: in its scope."""
 METHODS_WITH_BODY = ("POST", "PUT", "PATCH", "DELETE")
 
 
@@ -139,6 +141,7 @@ class Limiter:
         await self._serve(scope, receive, send)
 
     async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
+        scope[HEARD_S] = asyncio.get_running_loop().time()
         service = scope["path"].startswith(SERVICES_PREFIX)
         if self._waiting_n >= self._limits.waiting_n + self._limits.active_n:
             await self._refuse("more requests at once than the daemon serves", scope, receive, send)

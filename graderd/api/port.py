@@ -30,8 +30,8 @@ class DaemonPort(Protocol):
         """Wait for a status newer than ``after_s`` (monotonic) and return it."""
         ...
 
-    async def command(self, command: Command) -> Reply:
-        """Hand a command to the next tick and wait for its reply."""
+    async def command(self, command: Command, waited_s: float = 0.0) -> Reply:
+        """Hand a command to the next tick and wait for its reply. ``waited_s``: since it was heard."""
         ...
 
     def stop(self, command: Stop) -> Reply:

@@ -26,9 +26,9 @@ from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from graderd.api.http_head import JudgedConnection, problem_of_head
+from graderd.api.http_head import SENT_AHEAD, JudgedConnection, problem_of_head
 from graderd.api.settings import ApiLimits, TcpSettings
-from graderd.api.stop import StopLane, is_stop_line
+from graderd.api.stop import StopLane, is_stop_line, is_stop_target
 from graderd.api.stop_socket import serving_stops, stop_socket_beside
 from graderd.api.tcp_guard import Grant, TcpGuard, Tokens
 from graderd.hal.clock import Pace
@@ -204,6 +204,8 @@ LISTEN_QUEUE_N = 128
 STREAM_BUFFER_BYTES = 16_384
 READ_BYTES = 1024
 """Some hundred of the smallest frames: a few milliseconds."""
+READ_AHEAD_BYTES = 16_384
+"""So much of what is sent ahead of its answers is taken, and looked through for a stop."""
 LINGER_S = 0.5
 HANDSHAKE_S = 5.0
 HANDSHAKES_N = 64
@@ -482,6 +484,7 @@ def _bounded_http(limits: ApiLimits, guard: TcpGuard | None, stops: StopLane) ->
             self.conn = self._judged = JudgedConnection(guard)
             self.app_state = self._judged.known
             self._ending: asyncio.TimerHandle | None = None
+            self._looked_at_n = 0
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as in uvicorn
             super().connection_made(transport)
@@ -500,8 +503,26 @@ def _bounded_http(limits: ApiLimits, guard: TcpGuard | None, stops: StopLane) ->
             super().connection_lost(exc)
 
         def data_received(self, data: bytes) -> None:
-            if self._ending is None:
-                super().data_received(data)
+            if self._ending is not None:
+                return
+            super().data_received(data)
+            if self.conn.their_state is h11.DONE and (ahead := self.conn.trailing_data[0]):
+                self._look_ahead(ahead)
+
+        def _look_ahead(self, ahead: bytes) -> None:
+            """What was sent before the request in work was answered. A stop in it waits for no other's answer; what
+            moves is not obeyed here any more, for nobody can tell when it was said."""
+            self._judged.known[SENT_AHEAD] = True
+            if len(ahead) < READ_AHEAD_BYTES:
+                self.flow.resume_reading()
+            if len(ahead) < self._looked_at_n:
+                self._looked_at_n = 0
+            # From the beginning of the line that was not complete; a request follows the body before it on one line.
+            begin = ahead.rfind(b"\n", 0, self._looked_at_n) + 1
+            self._looked_at_n = len(ahead)
+            admitted = guard is None or self._judged.known.get("grant") is not None
+            if admitted and any(map(is_stop_target, ahead[begin:].split())):
+                stops.overtake()
 
         def send_400_response(self, msg: str) -> None:
             """What was not taken is answered in the same form as everything else, as far as it can be answered."""

@@ -45,6 +45,8 @@ NEVER_READ = {
 WAITING_N = 1000
 """Messages of one client that wait for their answers. One that sends more, and faster than it is obeyed, is let go: a
 stop of its own would come to nobody."""
+AT_ONCE_N = 16
+"""Of them handed to one tick: half of what that takes of all its clients."""
 log = logging.getLogger(__name__)
 UPGRADE_ONLY: dict[int | str, dict[str, Any]] = {
     101: {"description": "the WebSocket is open"},
@@ -110,7 +112,7 @@ def socket_routes(
         """The client sends commands (`jog`, `preset`, `renew`, `release`, or any other), one a message, and gets for
         each a `Reply` or a `Problem`, in order. A stop overtakes what was sent before it and was not obeyed yet: that
         is void. Who has more than 1000 messages waiting is let go. The lease belongs to the connection: it is given
-        back when that ends for whatever reason, and lapses by itself 0.3 s after the last `renew`."""
+        back when that ends for whatever reason, and lapses by itself 0.3 s after the last `renew` came."""
         raise _upgrade_needed("jog")
 
     @router.get("/bus/{name}", tags=["status"], summary="WebSocket: a wire as it is", responses=UPGRADE_ONLY)
@@ -124,18 +126,20 @@ def socket_routes(
 
 
 class _Waiting(NamedTuple):
-    """A message that waits for its answer. ``stops_n``: how many stops of this client came before it; ``answer``: where
-    it was one itself."""
+    """A message that waits for its answer. ``stops_n``: how many stops of this client came before it; ``heard_s``: when
+    it came, by the event loop's clock; ``answer``: where it was a stop itself."""
 
     text: bytes
     stops_n: int
+    heard_s: float
     answer: Reply | None = None
 
 
 class _JogSession:
     """One client's connection: its commands carry a name nobody else has, so its lease is its own.
 
-    They are obeyed one after the other, and read ahead: a stop among them overtakes what waits, which it makes void.
+    They are read ahead, and those that wait are handed to one tick in their order: who sends more often than it ticks
+    is not obeyed ever later. A stop among them overtakes what waits, which it makes void.
     """
 
     def __init__(self, port: DaemonPort, limits: ApiLimits, stops: StopLane, client: str, by: str) -> None:
@@ -145,7 +149,7 @@ class _JogSession:
         self._stops = stops
         self._client = client
         self._moved = False
-        self._stops_n = 0
+        self._stops_n = self._malformed_n = 0
         self._waiting: asyncio.Queue[_Waiting] = asyncio.Queue(WAITING_N)
 
     async def run(self, socket: WebSocket) -> None:
@@ -163,9 +167,17 @@ class _JogSession:
 
     async def _obey_all(self, socket: WebSocket) -> None:
         while True:
-            answer = await self._answer(await self._waiting.get())
-            await socket.send_text(answer.model_dump_json())
-            await asyncio.sleep(0)  # answers that are ready must not keep the tick waiting for the last of them
+            asked = [await self._waiting.get()]
+            while len(asked) < AT_ONCE_N and not self._waiting.empty():
+                asked.append(self._waiting.get_nowait())
+            answers = await asyncio.gather(*map(self._answer, asked))
+            if self._malformed_n:
+                # A client in a loop of nonsense is slowed down.
+                await asyncio.sleep(MALFORMED_PAUSE_S * self._malformed_n)
+                self._malformed_n = 0
+            for reply in answers:
+                await socket.send_text(reply.model_dump_json())
+                await asyncio.sleep(0)  # answers that are ready must not keep the tick waiting for the last of them
 
     async def _read(self, socket: WebSocket) -> None:
         """Read until the client goes, and carry stops out as they come."""
@@ -185,7 +197,7 @@ class _JogSession:
             if self._waiting.full():
                 await socket.close(POLICY, "more messages than are obeyed")
                 return
-            self._waiting.put_nowait(_Waiting(said, self._stops_n, answer))
+            self._waiting.put_nowait(_Waiting(said, self._stops_n, asyncio.get_running_loop().time(), answer))
 
     async def release(self) -> None:
         """Give the lease back, if this client ever had one. A refusal only says that it has lapsed already."""
@@ -193,7 +205,8 @@ class _JogSession:
             self._moved = False
             # A tick that does not answer lets the lease lapse by itself, or has stopped: nothing more to do here.
             with contextlib.suppress(ProblemError):
-                await obey(self._port, Release(client=self._client), self._limits, self._by)
+                now_s = asyncio.get_running_loop().time()
+                await obey(self._port, Release(client=self._client), self._limits, self._by, now_s)
 
     async def _answer(self, asked: _Waiting) -> Reply | Problem:
         if asked.answer is not None:
@@ -203,15 +216,14 @@ class _JogSession:
         try:
             command = COMMAND.validate_json(asked.text).model_copy(update={"client": self._client})
         except ValidationError as error:
-            # A client in a loop of nonsense is slowed down; its connection is read again only afterwards.
-            await asyncio.sleep(MALFORMED_PAUSE_S)
+            self._malformed_n += 1
             return problem_of_validation(error.errors(include_input=False, include_url=False))
         if isinstance(command, Jog | Preset):
             self._moved = True
         if isinstance(command, Release):
             self._moved = False
         try:
-            reply = await obey(self._port, command, self._limits, self._by)
+            reply = await obey(self._port, command, self._limits, self._by, asked.heard_s)
         except ProblemError as error:
             return error.problem
         return reply

@@ -41,10 +41,15 @@ def is_stop_path(path: str) -> bool:
     return [part for part in path.lower().split("/") if part] == ["v1", "stop"]
 
 
+def is_stop_target(target: bytes) -> bool:
+    """Whether a request for ``target``, a path and perhaps a query, is a stop."""
+    return is_stop_path(target.partition(b"?")[0].decode("latin-1"))
+
+
 def is_stop_line(line: bytes) -> bool:
     """Whether a request that begins so is a stop; the rest of its head may be no HTTP at all."""
     words = line.partition(b"\n")[0].split()
-    return len(words) >= 2 and is_stop_path(words[1].partition(b"?")[0].decode("latin-1"))
+    return len(words) >= 2 and is_stop_target(words[1])
 
 
 def is_stop_command(message: bytes | bytearray, complete: bool = True) -> bool:
@@ -116,6 +121,11 @@ class StopLane:
     def at_once(self) -> Reply:
         """Stop for a request of which only the first line could be read."""
         return self._port.stop(Stop(reason=REASON))
+
+    def overtake(self) -> None:
+        """Stop for a request whose turn has not come yet; it gets its answer then. Not one for each of a flood."""
+        if self._pace.take(asyncio.get_running_loop().time()) or self._port.status().mode is not Mode.STOPPED:
+            self._port.stop(Stop(reason=REASON))
 
     async def serve(self, receive: Receive, by: str) -> Reply:
         """Stop for an HTTP request whose line has come; its body is taken as far as it has come with it."""

@@ -46,6 +46,9 @@ class Preset(Settings):
     lift_before_rotation: bool = False
 
 
+_STEEPEST_DEG = 89.999
+
+
 @dataclass(frozen=True, slots=True)
 class Attitude:
     """Height of the cutting edge's centre (mm) and cross slope (deg)."""
@@ -64,9 +67,12 @@ def lift_attitude(geometry: AttitudeGeometry, left_mm: float, right_mm: float) -
 
 
 def lift_extensions(geometry: AttitudeGeometry, attitude: Attitude) -> tuple[float, float]:
-    """Left and right lift extension (mm) for a height and slope; the inverse of :func:`lift_attitude`."""
+    """Left and right lift extension (mm) for a height and slope; the inverse of :func:`lift_attitude`. What is as steep
+    as upright or more is out of any lift's reach."""
     sign = 1.0 if geometry.lift_raises_by_extending else -1.0
-    half = math.tan(math.radians(attitude.slope_deg)) * geometry.lift_spacing_mm / 2.0
+    # Beyond upright the tangent begins anew: 180 deg would be level.
+    slope_deg = min(max(attitude.slope_deg, -_STEEPEST_DEG), _STEEPEST_DEG)
+    half = math.tan(math.radians(slope_deg)) * geometry.lift_spacing_mm / 2.0
     scale = sign / geometry.lift_height_ratio
     return (
         geometry.lift_ground_mm + scale * (attitude.height_mm + half),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictBool
 
 from graderd.core.axes import JogName
 from graderd.hal.text import printable
@@ -61,7 +61,7 @@ class Reset(_Command):
     """Leave the latched stop for disarmed. It clears the stop it names and none that came after it."""
 
     command: Literal["reset"] = "reset"
-    stop_n: int = Field(ge=0, description="number of the stop that is cleared, as status tells it")
+    stop_n: int = Field(strict=True, ge=0, description="number of the stop that is cleared, as status tells it")
 
 
 class Auto(_Command):
@@ -85,8 +85,8 @@ class Jog(_Command):
 
     command: Literal["jog"] = "jog"
     axis: JogName
-    value: Annotated[float, Field(allow_inf_nan=False, description="in the axis's unit: deg or mm")]
-    relative: bool = False
+    value: Annotated[float, Field(strict=True, allow_inf_nan=False, description="in the axis's unit: deg or mm")]
+    relative: StrictBool = False
 
 
 class Preset(_Command):

@@ -97,6 +97,7 @@ class Inputs(NamedTuple):
     the gate lets it have; ``arrived``: at its goal. ``held``: why an axis with a goal was not let move, by axis.
     All three speak of the goals of the tick before.
     ``devices_active``: all required devices are ACTIVE. ``arm_error``: why arming the devices failed, once.
+    ``waited_s``: for how long each command waited to be obeyed, in their order; not at all beyond its end.
     ``unmet``: mandatory for arming and not met; ``unmet_for_auto``: for automatic operation.
     ``resolve``: turns a jog or preset into goals in stages, or gives the reason it cannot.
     """
@@ -104,6 +105,7 @@ class Inputs(NamedTuple):
     now_s: float
     resolve: Callable[[cmd.Jog | cmd.Preset, Pose], tuple[Goals, ...] | str]
     commands: tuple[cmd.Command, ...] = ()
+    waited_s: tuple[float, ...] = ()
     observation: SoilObservation | None = None
     travel: Travel | None = None
     pose: Pose = Pose()
@@ -144,13 +146,14 @@ def step(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSett
     state = _lapse(_react(state, inputs), inputs.now_s)
     replies: list[cmd.Reply] = []
     stop_asked = any(isinstance(c, cmd.Stop) for c in inputs.commands)
-    for command in sorted(inputs.commands, key=lambda c: not isinstance(c, cmd.Stop)):
+    for n in sorted(range(len(inputs.commands)), key=lambda n: not isinstance(inputs.commands[n], cmd.Stop)):
+        command, heard_s = inputs.commands[n], inputs.now_s - (*inputs.waited_s[n : n + 1], 0.0)[0]
         if stop_asked and isinstance(command, cmd.Reset):
             replies.append(
                 cmd.Reply(command="reset", accepted=False, message="stopped this moment", remedy="reset again")
             )
             continue
-        state, reply = _obey(state, command, inputs, settings)
+        state, reply = _obey(state, command, heard_s, inputs, settings)
         replies.append(reply)
     if state.goals != before.goals:  # taken in this tick: not reached yet, and nothing has held them
         inputs = inputs._replace(settled=False, arrived=False, held=NOTHING_HELD)
@@ -213,7 +216,12 @@ def lapse_of(client: str) -> str:
     return f"lease of {client or 'the client'} lapsed"
 
 
-def _obey(state: State, command: cmd.Command, inputs: Inputs, settings: MachineSettings) -> tuple[State, cmd.Reply]:
+def _obey(
+    state: State, command: cmd.Command, heard_s: float, inputs: Inputs, settings: MachineSettings
+) -> tuple[State, cmd.Reply]:
+    """A lease counts from when its client was heard, not from when its turn came: one that has gone meanwhile moves
+    nothing by what it left waiting."""
+
     def yes(new: State, message: str) -> tuple[State, cmd.Reply]:
         return new, cmd.Reply(command=command.command, accepted=True, message=message)
 
@@ -239,7 +247,7 @@ def _obey(state: State, command: cmd.Command, inputs: Inputs, settings: MachineS
                 return no(f"stop number {state.stop_n} is latched: {state.reason}", "read why, then reset that one")
             return yes(_disarmed(state, "reset"), "reset; arm when the area around the blade is clear")
         case cmd.Renew() | cmd.Release():
-            return _lease_command(state, command, inputs.now_s, settings, yes, no)
+            return _lease_command(state, command, heard_s, settings, yes, no)
     if state.lease is not None and state.lease.client != command.client:
         return no(
             f"{state.lease.client or 'another client'} is moving the blade",
@@ -272,7 +280,9 @@ def _obey(state: State, command: cmd.Command, inputs: Inputs, settings: MachineS
     stages = inputs.resolve(command, inputs.pose)
     if isinstance(stages, str):
         return no(stages, "ask for a position inside the limits")
-    lease = Lease(command.client, inputs.now_s + settings.lease_s)
+    lease = Lease(command.client, heard_s + settings.lease_s)
+    if inputs.now_s > lease.expires_s:
+        return no(f"asked {inputs.now_s - heard_s:.1f} s ago, and not renewed since", "ask again, and for less at once")
     moving = replace(state, goals=stages[0], later=stages[1:], lease=lease, reason=f"{command.command} by hand")
     return yes(moving, "moving while the lease is renewed")
 
@@ -280,7 +290,7 @@ def _obey(state: State, command: cmd.Command, inputs: Inputs, settings: MachineS
 def _lease_command(
     state: State,
     command: cmd.Renew | cmd.Release,
-    now_s: float,
+    heard_s: float,
     settings: MachineSettings,
     yes: Callable[[State, str], tuple[State, cmd.Reply]],
     no: Callable[[str, str], tuple[State, cmd.Reply]],
@@ -288,7 +298,8 @@ def _lease_command(
     if state.lease is None or state.lease.client != command.client:
         return no("you hold no lease", "send the jog again")
     if isinstance(command, cmd.Renew):
-        return yes(replace(state, lease=Lease(command.client, now_s + settings.lease_s)), "renewed")
+        until_s = max(state.lease.expires_s, heard_s + settings.lease_s)
+        return yes(replace(state, lease=Lease(command.client, until_s)), "renewed")
     return yes(_manual(state, "released"), "released; holding")
 
 

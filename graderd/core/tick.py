@@ -77,7 +77,8 @@ class Sensed:
     """Everything one tick knows.
 
     ``axes``: by axis name. ``faults``: conditions that devices, bus, camera and daemon report now. ``commands``: since
-    the tick before, in their order. ``observation``: a new one, once. ``powered``: every device is ACTIVE and none is
+    the tick before, in their order; ``waited_s``: for how long each was waiting by then, not at all beyond its end.
+    ``observation``: a new one, once. ``powered``: every device is ACTIVE and none is
     being armed or disarmed. ``arm_error``: why arming the devices failed, once. ``refused``: what a driver said to the
     goal of the tick before, by axis. ``late_s``: how much later than planned this tick comes.
     ``vehicle``: how the machine drives.
@@ -87,6 +88,7 @@ class Sensed:
     axes: Mapping[str, AxisSensed]
     faults: tuple[DeviceFault, ...] = ()
     commands: tuple[cmd.AnyCommand, ...] = ()
+    waited_s: tuple[float, ...] = ()
     observation: SoilObservation | None = None
     powered: bool = False
     arm_error: str = ""
@@ -183,6 +185,7 @@ class Controller:
                 now_s=now_s,
                 resolve=lambda command, at: resolve(command, at, settings.attitude, settings.presets, settings.figures),
                 commands=sensed.commands,
+                waited_s=sensed.waited_s,
                 observation=sensed.observation,
                 travel=_travel(sensed.vehicle, now_s, settings.max_vehicle_age_s),
                 pose=pose,

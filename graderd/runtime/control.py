@@ -6,7 +6,8 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Protocol
+from itertools import islice
+from typing import NamedTuple, Protocol
 
 from graderd.config import Config
 from graderd.config.tick import tick_settings
@@ -23,6 +24,7 @@ from graderd.runtime.state_file import LastStop, StateFile
 
 MAX_COMMANDS_PER_TICK = 32
 LATENESS_WINDOW_N = 500
+ENDING = (cmd.Disarm, cmd.Manual, cmd.Release)
 BEFORE = "stopped before the daemon was started"
 
 log = logging.getLogger(__name__)
@@ -44,6 +46,14 @@ class Eyes(Protocol):
         ...
 
 
+class Queued(NamedTuple):
+    """A command that waits for its tick, since when, and who waits for its reply."""
+
+    command: cmd.Command
+    heard_s: float
+    reply: asyncio.Future[cmd.Reply]
+
+
 def _state_at_start(last_stop: LastStop | None) -> State:
     """Stopped, where nobody has let go of what stopped the machine before it was started anew. Stops are counted on."""
     if last_stop is None:
@@ -61,7 +71,7 @@ class ControlLoop:
     ``fault_sources``: told the time, each says what it sees wrong now. ``on_tick``: called at the end of every tick.
     ``on_step``: called with what every step of the controller knew and decided, those of a stop between two ticks
     included; the wires have been told by then. ``controller`` and its ``settings`` are for the recorder to read.
-    ``ticks_n``, ``decisions_n``: since the start.
+    ``ticks_n``, ``decisions_n``: since the start. ``armed_by``: who asked for the newest arming.
     """
 
     def __init__(
@@ -87,21 +97,22 @@ class ControlLoop:
         self._clock = clock
         self._state_file = state_file
         self._power = PowerSequencer(devices)
-        self._queue: deque[tuple[cmd.Command, asyncio.Future[cmd.Reply]]] = deque()
+        self._queue: deque[Queued] = deque()
         self._refused: dict[str, str] = {}
         self._keep_last_stop = False
-        self._armed_by = ""
+        self.armed_by = ""
         self.sensed = self._sensed(())
         self.tick = self.controller.step(self.sensed)
 
     # ---- commands -------------------------------------------------------------------------------------------------
 
-    async def command(self, command: cmd.Command) -> cmd.Reply:
-        """Hand a command to the next tick and wait for its reply. Stop acts on the wires before it returns."""
+    async def command(self, command: cmd.Command, waited_s: float = 0.0) -> cmd.Reply:
+        """Hand a command to the next tick and wait for its reply. Stop acts on the wires before it returns.
+        ``waited_s``: for how long it waited before."""
         if isinstance(command, cmd.Stop):
             return self.stop_now(command)
         future: asyncio.Future[cmd.Reply] = asyncio.get_running_loop().create_future()
-        self._queue.append((command, future))
+        self._queue.append(Queued(command, self._clock.now_s() - waited_s, future))
         return await future
 
     def stop_now(self, command: cmd.Stop) -> cmd.Reply:
@@ -109,12 +120,11 @@ class ControlLoop:
         self._hold_all()
         reply = self._step((command,))[0]
         while self._queue:
-            queued, future = self._queue.popleft()
-            if not future.done():
-                void = cmd.Reply(
-                    command=queued.command, accepted=False, message=cmd.STOP_CAME_FIRST, remedy=cmd.STOP_REMEDY
-                )
-                future.set_result(void)
+            queued = self._queue.popleft()
+            if not queued.reply.done():
+                name = queued.command.command
+                void = cmd.Reply(command=name, accepted=False, message=cmd.STOP_CAME_FIRST, remedy=cmd.STOP_REMEDY)
+                queued.reply.set_result(void)
         return reply
 
     def end(self, reason: str) -> bool:
@@ -145,18 +155,28 @@ class ControlLoop:
 
     def run_tick(self, late_s: float = 0.0) -> None:
         """Sense, decide, act, with the commands that came meanwhile."""
-        queued = [self._queue.popleft() for _ in range(min(len(self._queue), MAX_COMMANDS_PER_TICK))]
-        replies = self._step(tuple(command for command, _ in queued), late_s)
-        for (_, future), reply in zip(queued, replies, strict=True):
-            if not future.done():
-                future.set_result(reply)
+        queued = list(islice(self._taken(), MAX_COMMANDS_PER_TICK))
+        replies = self._step(tuple(asked.command for asked in queued), late_s, tuple(asked.heard_s for asked in queued))
+        for asked, reply in zip(queued, replies, strict=True):
+            if not asked.reply.done():
+                asked.reply.set_result(reply)
         if self.on_tick is not None:
             self.on_tick()
 
-    def _step(self, commands: tuple[cmd.Command, ...], late_s: float = 0.0) -> tuple[cmd.Reply, ...]:
+    def _taken(self) -> Iterator[Queued]:
+        """What is queued, without what nobody waits for any more: nothing is begun for who has gone, or was told that
+        nothing came of it. What only ends something counts all the same."""
+        while self._queue:
+            asked = self._queue.popleft()
+            if not asked.reply.done() or isinstance(asked.command, ENDING):
+                yield asked
+
+    def _step(
+        self, commands: tuple[cmd.Command, ...], late_s: float = 0.0, heard_s: tuple[float, ...] = ()
+    ) -> tuple[cmd.Reply, ...]:
         before = self.tick.state
         self.ticks_n += 1
-        self.sensed = self._sensed(commands, late_s)
+        self.sensed = self._sensed(commands, late_s, heard_s)
         self.tick = self.controller.step(self.sensed)
         self._act(self.tick)  # the wires come first, then whoever wants to know
         self.decisions_n += self.tick.state.decision.decided_s > before.decision.decided_s
@@ -170,9 +190,8 @@ class ControlLoop:
         return (c for c, reply in zip(self.sensed.commands, self.tick.replies, strict=True) if reply.accepted)
 
     def _note(self, before: State, after: State) -> None:
-        for command in self._obeyed():
-            if isinstance(command, cmd.Arm):
-                self._armed_by = command.client
+        if after.arming_since_s not in (None, before.arming_since_s):
+            self.armed_by = next((command.client for command in self._obeyed() if isinstance(command, cmd.Arm)), "")
         if after.mode is Mode.STOPPED:
             # A second reason as well as the first: who starts the daemon anew has to know both.
             if after.stops != before.stops and not self._keep_last_stop:
@@ -186,12 +205,14 @@ class ControlLoop:
         """Who or what changed the mode stands in fields of its own beside the text."""
         client = next((command.client for command in self._obeyed() if command.client), "")
         if before is Mode.DISARMED and after.mode is Mode.MANUAL:
-            client = self._armed_by  # asked for before the devices were powered
+            client = self.armed_by  # asked for before the devices were powered
         fault = next((f.name for f in self.tick.faults if after.reason.startswith(f"{f.name}: ")), "")
         fields = {"event": True, "mode": after.mode, "client": client, "fault": fault}
         log.info("%s -> %s: %s", before, after.mode, after.reason, extra=fields)
 
-    def _sensed(self, commands: tuple[cmd.Command, ...], late_s: float = 0.0) -> Sensed:
+    def _sensed(
+        self, commands: tuple[cmd.Command, ...], late_s: float = 0.0, heard_s: tuple[float, ...] = ()
+    ) -> Sensed:
         """Everything that is known now; each device is asked once."""
         now_s = self._clock.now_s()
         found: list[DeviceFault] = [*self._devices.link.faults(), *self._eyes.faults()]
@@ -209,6 +230,7 @@ class ControlLoop:
             axes=axes,
             faults=tuple(found),
             commands=commands,
+            waited_s=tuple(max(0.0, now_s - at_s) for at_s in heard_s),
             observation=self._eyes.take_observation(),
             powered=self._power.all_active,
             arm_error=self._power.take_error(),

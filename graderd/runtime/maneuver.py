@@ -46,6 +46,7 @@ class Maneuver:
         Who gave up before it would leave behind a machine that becomes armed, with nobody there."""
         while True:
             state = self._loop.tick.state
+            self._check_ours()
             if state.arming_since_s is None:
                 break
             await asyncio.sleep(SAMPLE_S)
@@ -57,7 +58,8 @@ class Maneuver:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        await self._loop.command(cmd.Disarm(client=CLIENT))
+        if self._loop.armed_by == CLIENT:
+            await self._loop.command(cmd.Disarm(client=CLIENT))
 
     async def rotate_to(self, angle_deg: float, dwell_s: float, each: Callable[[], None] | None = None) -> None:
         """Go to ``angle_deg`` and stay until ``dwell_s`` after the start; ``each`` is called every 20 ms.
@@ -66,6 +68,7 @@ class Maneuver:
             DeviceRefusedError: beyond a limit, or another client is moving the blade.
             DeviceLostError: the machine left manual mode (stop, fault) under way, or the rotation was held.
         """
+        self._check_manual()
         await self._jog(angle_deg)
         clock = asyncio.get_running_loop().time
         end_s = clock() + dwell_s
@@ -100,7 +103,13 @@ class Maneuver:
         if state.reason != lapse_of(CLIENT):
             raise DeviceLostError("maneuver", f"ended under way: {state.reason}")
 
+    def _check_ours(self) -> None:
+        """What somebody stopped or disarmed, and another armed again, is that one's machine: nothing goes on there."""
+        if (armed_by := self._loop.armed_by) != CLIENT:
+            raise DeviceLostError("maneuver", f"ended under way: {armed_by or 'somebody'} has armed the machine since")
+
     def _check_manual(self) -> None:
+        self._check_ours()
         state = self._loop.tick.state
         if state.mode is not Mode.MANUAL:
             raise DeviceLostError("maneuver", f"ended under way: {state.reason}")

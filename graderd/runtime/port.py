@@ -74,9 +74,9 @@ class Port:
         self._waiting.append(future)
         return await future
 
-    async def command(self, command: Command) -> Reply:
+    async def command(self, command: Command, waited_s: float = 0.0) -> Reply:
         """Hand a command to the next tick."""
-        return await self._loop.command(command)
+        return await self._loop.command(command, waited_s)
 
     def stop(self, command: Stop) -> Reply:
         """Every wire is told now, between two ticks: who asks afterwards sees the machine stopped."""

@@ -20,6 +20,7 @@ from graderd.api.app import make_app
 from graderd.api.port import DaemonPort
 from graderd.api.server import SocketError, SocketInUseError, serve
 from graderd.api.settings import ApiLimits
+from graderd.core import commands as cmd
 from graderd.core.machine import Mode, Unmet
 from graderd.core.status import Status
 from harness.api_daemon import JPEG, FakeDaemon, serving, within
@@ -92,6 +93,10 @@ MALFORMED: list[tuple[bytes, str]] = [
     (b'{"command": "jog", "axis": "rotate", "value": NaN}', "jog.value"),
     (b'{"command": "jog", "axis": "rotate", "value": Infinity}', "jog.value"),
     (b'{"command": "jog", "axis": "rotate", "value": 1e999}', "jog.value"),
+    (b'{"command": "jog", "axis": "rotate", "value": "5"}', "jog.value"),
+    (b'{"command": "jog", "axis": "rotate", "value": true}', "jog.value"),
+    (b'{"command": "jog", "axis": "rotate", "value": 1, "relative": "no"}', "jog.relative"),
+    (b'{"command": "reset", "stop_n": true}', "reset.stop_n"),
     (b'{"command": "jog", "axis": "wheel", "value": 1}', "jog.axis"),
     (b'{"command": "jog", "axis": "rotate"}', "jog.value"),
     (b'{"command": "arm", "client": "' + b"x" * 81 + b'"}', "arm.client"),
@@ -333,6 +338,41 @@ async def test_requests_that_wait_when_the_daemon_ends_are_answered(
     writer.close()
     await writer.wait_closed()
     assert [record for record in caplog.records if record.levelname == "ERROR"] == []
+
+
+async def test_nothing_moves_for_what_was_sent_ahead_of_the_answers(tmp_path: Path) -> None:
+    """A client that sent three hundred renewals at once, and went, was moved for six seconds."""
+
+    def post(body: bytes) -> bytes:
+        head = b"POST /v1/commands HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+        return head + b"Content-Length: %d\r\n\r\n%b" % (len(body), body)
+
+    async with serving(tmp_path) as (daemon, path), client_of(path) as other:
+        await other.post("/v1/commands", json={"command": "arm"})
+        await daemon.until_mode(Mode.MANUAL)
+        reader, writer = await asyncio.open_unix_connection(str(path))
+        move, renewal = (post(b'{"command": "jog", "axis": "rotate", "value": 50}'), post(b'{"command": "renew"}'))
+        writer.write(move + renewal * 60 + post(b'{"command": "release"}'))
+        for n in range(62):
+            answer = await within(5, reader.readuntil(b'"remedy":'))
+            assert (b"sent ahead of the answers" in answer) is (0 < n < 61)
+        assert not any(isinstance(command, cmd.Renew) for command in daemon.seen)
+        writer.close()
+
+
+async def test_a_request_counts_from_when_it_had_come(tmp_path: Path) -> None:
+    """Not from when its turn came in a flood."""
+    waits_s: list[float] = []
+    async with serving(tmp_path, limits=ApiLimits(rate_hz=10.0, burst_n=1)) as (daemon, path), client_of(path) as one:
+        hand_over = daemon.command
+
+        async def noted(command: cmd.Command, waited_s: float = 0.0) -> cmd.Reply:
+            waits_s.append(waited_s)
+            return await hand_over(command, waited_s)
+
+        daemon.command = noted  # type: ignore[method-assign]
+        await asyncio.gather(*(one.post("/v1/commands", json={"command": "renew"}) for _ in range(4)))
+    assert max(waits_s) > 0.15
 
 
 @pytest.mark.parametrize("name", ["", "cab", "jog#1", "cab#1", "maneuver"])

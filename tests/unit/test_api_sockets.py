@@ -192,6 +192,40 @@ async def test_who_sends_more_than_is_obeyed_is_let_go(tmp_path: Path, monkeypat
         assert daemon.state.reason == "released"
 
 
+async def test_who_renews_more_often_than_it_ticks_is_not_obeyed_ever_later(tmp_path: Path) -> None:
+    """A page renews with each of its sixty pictures a second: what waited kept its lease when it had gone."""
+    async with serving(tmp_path) as (daemon, path):
+        await armed(daemon)
+        async with connect(path, "/v1/jog") as socket:
+            await socket.send('{"command": "jog", "axis": "rotate", "value": 50.0}')
+            for _ in range(300):
+                await socket.send('{"command": "renew"}')
+            begin_n = len(daemon.late_s)
+            for _ in range(301):
+                await within(5, socket.recv())
+            assert len(daemon.late_s) - begin_n < 100
+
+
+async def test_a_command_counts_from_when_it_was_heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sockets, "AT_ONCE_N", 1)
+    waits_s: list[float] = []
+    async with serving(tmp_path) as (daemon, path):
+        await armed(daemon)
+        hand_over = daemon.command
+
+        async def noted(command: cmd.Command, waited_s: float = 0.0) -> cmd.Reply:
+            waits_s.append(waited_s)
+            return await hand_over(command, waited_s)
+
+        daemon.command = noted  # type: ignore[method-assign]
+        async with connect(path, "/v1/jog") as socket:
+            for _ in range(30):
+                await socket.send('{"command": "renew"}')
+            for _ in range(30):
+                await within(5, socket.recv())
+    assert waits_s[-1] > 0.2  # thirty ticks of 20 ms, one for each
+
+
 async def test_a_message_that_is_too_large_ends_the_connection_and_the_lease(tmp_path: Path) -> None:
     async with serving(tmp_path) as (daemon, path):
         await armed(daemon)

@@ -17,7 +17,7 @@ from graderd.api.settings import ApiLimits, TcpSettings
 from graderd.api.stop_socket import stop_socket_beside
 from graderd.core.machine import Mode
 from graderd.tokens import Right, create_token
-from harness.api_daemon import free_port, serving, within
+from harness.api_daemon import FakeDaemon, free_port, serving, within
 from harness.awake_clock import AwakeClock
 from tests.unit.test_api_sockets import connect
 
@@ -157,6 +157,31 @@ async def test_a_stop_on_the_jog_socket_overtakes_what_was_sent_before_it(tmp_pa
         assert answers[200]["error"] == "a stop came first"
         assert (answers[202]["command"], answers[202]["accepted"]) == ("arm", False)
         assert (daemon.state.mode, daemon.state.stop_n) == (Mode.STOPPED, 1)
+
+
+@pytest.mark.parametrize("between_n", [0, 40])
+@pytest.mark.parametrize("at_once", [True, False])
+async def test_a_stop_sent_ahead_of_the_answer_to_another_request_waits_for_none(
+    tmp_path: Path, at_once: bool, between_n: int
+) -> None:
+    """HTTP lets a client send the next request before the last is answered; a stop waited 3 s behind a picture."""
+    daemon = FakeDaemon(frozen=True)
+    async with serving(tmp_path, daemon, limits=ApiLimits(command_timeout_s=10.0)) as (_, path):
+        _, writer = await asyncio.open_unix_connection(str(path))
+        arm = post(b"/v1/commands", b'{"command": "arm"}').replace(
+            b"\r\n", b"\r\nContent-Type: application/json\r\n", 1
+        )
+        writer.write(arm)
+        if not at_once:
+            await daemon.until(lambda: bool(daemon.waiting))
+        writer.write(arm * between_n)
+        head, rest = post(b"/v1/stop", b"").split(b"op", 1)
+        writer.write(head)
+        await writer.drain()
+        writer.write(b"op" + rest)
+        await daemon.until_mode(Mode.STOPPED)
+        assert daemon.waiting
+        writer.close()
 
 
 @pytest.mark.parametrize("target", [b"/v1/stop", b"/v1/commands"])

@@ -51,6 +51,14 @@ def test_every_attitude_survives_the_round_trip(
     assert pitch_deg(geometry, tilt_extension(geometry, pitch)) == pytest.approx(pitch, abs=1e-9)
 
 
+@pytest.mark.parametrize("slope_deg", [90.0, 178.0, 180.0, 361.0, -180.0, 1e308])
+def test_what_is_steeper_than_upright_is_out_of_reach(slope_deg: float) -> None:
+    """The tangent begins anew beyond 90 deg: a slope of 180 deg was taken for level, and the blade went there."""
+    left_mm, right_mm = lift_extensions(AttitudeGeometry(), Attitude(100.0, slope_deg))
+    assert abs(left_mm - right_mm) > 1e6
+    assert (left_mm > right_mm) is (slope_deg > 0)
+
+
 def test_a_positive_slope_is_the_left_end_up_whichever_way_the_lifts_act() -> None:
     for extends in (True, False):
         geometry = AttitudeGeometry(lift_raises_by_extending=extends)

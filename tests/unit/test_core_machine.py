@@ -403,6 +403,29 @@ def test_a_late_renewal_renews_nothing() -> None:
     assert late.intents.goals.empty
 
 
+def test_a_lease_counts_from_when_its_client_was_heard() -> None:
+    """Not from when its turn came: one that sent renewals ahead, and went, was moved for as many seconds as those
+    waited."""
+    asked = do(MANUAL, J, devices_active=True, waited_s=(0.2,)).state
+    assert asked.lease is not None
+    assert asked.lease.expires_s == pytest.approx(NOW_S - 0.2 + SETTINGS.lease_s)
+    again = do(asked, cmd.Renew(client="a"), devices_active=True, now_s=NOW_S + 0.05, waited_s=(0.01,)).state
+    assert again.lease is not None
+    assert again.lease.expires_s == pytest.approx(NOW_S + 0.04 + SETTINGS.lease_s)
+    older = do(again, cmd.Renew(client="a"), devices_active=True, now_s=NOW_S + 0.06, waited_s=(0.25,)).state
+    assert older.lease == again.lease
+    # A stop is obeyed first; what each of the others waited stays its own.
+    both = do(MANUAL, J, cmd.Manual(client="a"), cmd.Stop(), devices_active=True, waited_s=(0.2, 9.0, 0.0))
+    assert both.state.mode is Mode.STOPPED
+
+
+def test_a_move_that_waited_for_longer_than_its_lease_is_not_begun() -> None:
+    late = do(MANUAL, J, devices_active=True, waited_s=(SETTINGS.lease_s + 0.01,))
+    assert not late.replies[0].accepted
+    assert late.intents.goals.empty
+    assert late.state.lease is None
+
+
 def test_holding_says_why_and_since_when() -> None:
     result = do(AUTO, devices_active=True, faults=(fault(Reaction.HOLD, name="camera.stale"),))
     assert result.state.holding == ("camera.stale since 0.6 s: it is broken",)

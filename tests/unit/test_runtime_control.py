@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from graderd.hal.device import Lifecycle
 from graderd.hal.errors import DeviceRefusedError
 from graderd.hal.fault import DeviceFault
 from graderd.runtime.app.journal import fields_of
-from graderd.runtime.control import ControlLoop
+from graderd.runtime.control import ControlLoop, Queued
 from graderd.runtime.control import log as control_log
 from graderd.runtime.health import SleepWatch
 from graderd.runtime.state_file import StateFile
@@ -62,6 +63,10 @@ class Bench:
         assert (await self.do(cmd.Arm(client="t"))).accepted
         await self.ticks(4)
         assert self.loop.tick.state.mode is Mode.MANUAL
+
+
+def queued(command: cmd.Command, bench: Bench) -> Queued:
+    return Queued(command, bench.machine.clock.now_s(), asyncio.get_running_loop().create_future())
 
 
 @pytest.fixture
@@ -200,31 +205,70 @@ async def test_after_a_freeze_the_reason_is_the_freeze(bench: Bench) -> None:
     assert {"daemon.loop_blocked", "rotation.no_reply"} <= {fault.name for fault in bench.loop.tick.faults}
 
 
+async def test_a_lease_counts_from_when_the_command_was_heard(bench: Bench) -> None:
+    await bench.arm()
+    asked = asyncio.create_task(bench.loop.command(cmd.Jog(axis="rotate", value=20.0, client="a"), waited_s=0.1))
+    await asyncio.sleep(0)
+    await bench.ticks()
+    assert (await asked).accepted
+    state = bench.loop.tick.state
+    assert state.lease is not None
+    assert state.lease.expires_s == pytest.approx(bench.loop.tick.now_s - TICK_S - 0.1 + 0.3)
+    assert list(bench.loop.sensed.waited_s) == pytest.approx([TICK_S + 0.1])
+
+
+@pytest.mark.parametrize(
+    ("command", "obeyed"),
+    [
+        (cmd.Jog(axis="rotate", value=20.0, client="a"), False),
+        (cmd.Auto(client="a"), False),
+        (cmd.Disarm(client="a"), True),
+    ],
+)
+async def test_nothing_is_begun_for_who_has_gone_and_what_ends_something_counts(
+    bench: Bench, command: cmd.Command, obeyed: bool
+) -> None:
+    """Its connection ended, or it was told that the tick did not answer, while the command waited for its tick."""
+    await bench.arm()
+    asked = asyncio.create_task(bench.loop.command(command))
+    await asyncio.sleep(0)
+    asked.cancel()
+    with suppress(asyncio.CancelledError):
+        await asked
+    bench.machine.log.clear()
+    await bench.ticks(3)
+    state = bench.loop.tick.state
+    assert (state.mode is Mode.DISARMED) is obeyed
+    assert state.lease is None
+    assert state.mode is not Mode.AUTO
+    assert not any("goal" in line for line in bench.machine.log)
+
+
 @pytest.mark.parametrize("at_work", ["jog", "auto", "arming"])
 async def test_after_a_sleep_of_the_computer_nothing_goes_on(bench: Bench, at_work: str) -> None:
     """No time went by on the clock by which all goes: readings and leases from before it were taken for fresh."""
     slept_s = 100.0
     bench.loop.fault_sources.append(SleepWatch(lambda: slept_s).faults)
     if at_work == "arming":
-        bench.loop._queue.append((cmd.Arm(client="a"), asyncio.get_running_loop().create_future()))
+        bench.loop._queue.append(queued(cmd.Arm(client="a"), bench))
         bench.loop.run_tick()
         assert bench.loop.tick.state.arming_since_s is not None
     else:
         await bench.arm()
         command = cmd.Jog(axis="rotate", value=20.0, client="a") if at_work == "jog" else cmd.Auto(client="a")
-        bench.loop._queue.append((command, asyncio.get_running_loop().create_future()))
+        bench.loop._queue.append(queued(command, bench))
         bench.loop.run_tick()
         assert bench.loop.tick.state.mode is (Mode.MANUAL if at_work == "jog" else Mode.AUTO)
     slept_s += 3600.0
     bench.machine.rotation.lose()
-    renewal: asyncio.Future[cmd.Reply] = asyncio.get_running_loop().create_future()
-    bench.loop._queue.append((cmd.Renew(client="a"), renewal))
+    renewal = queued(cmd.Renew(client="a"), bench)
+    bench.loop._queue.append(renewal)
     bench.loop.run_tick()
     state = bench.loop.tick.state
     assert (state.mode, state.arming_since_s, state.lease) == (Mode.DISARMED, None, None)
     assert state.reason.startswith("daemon.suspended: ")
     assert bench.loop.tick.intents.goals.empty
-    assert not (await renewal).accepted
+    assert not (await renewal.reply).accepted
     (fault,) = (fault for fault in bench.loop.tick.faults if fault.name == "daemon.suspended")
     assert fault.detail == "it slept for 3600.0 s"
     bench.machine.rotation.restore()

@@ -19,7 +19,7 @@ from graderd.core.machine import Lease, Mode
 from graderd.hal.device import DeviceService, Lifecycle, NoArguments
 from graderd.hal.errors import DeviceLostError, DeviceRefusedError
 from graderd.hal.fault import DeviceFault
-from graderd.runtime.control import ControlLoop
+from graderd.runtime.control import ControlLoop, Queued
 from graderd.runtime.maneuver import Maneuver
 from graderd.runtime.port import Port
 from graderd.runtime.state_file import StateFile
@@ -105,6 +105,64 @@ async def test_stop_ends_it_under_way(tmp_path: Path, sample: int) -> None:
                 await blade.rotate_to(40.0, 30.0, step_in)
         assert loop.tick.state.mode is Mode.STOPPED
         assert after_n == 0
+
+
+@pytest.mark.parametrize("when", ["under way", "between two turns", "while it arms"])
+@pytest.mark.parametrize("how", ["stop", "disarm"])
+@in_simulated_time
+async def test_what_another_has_ended_and_armed_again_is_anothers(tmp_path: Path, when: str, how: str) -> None:
+    """A calibration that waited for its picture turned the blade on after a stop, a reset and somebody's arm."""
+    async with running(tmp_path) as (machine, loop):
+        machine.rotation.arm_takes_s = 0.1
+        stood_deg: list[float] = []
+
+        async def arm_it_anew() -> None:
+            if how == "stop":
+                loop.stop_now(cmd.Stop(reason="person near the blade"))
+                await loop.command(cmd.Reset(stop_n=1, client="cab"))
+            else:
+                await loop.command(cmd.Disarm(client="cab"))
+            while not (await loop.command(cmd.Arm(client="cab"))).accepted:
+                pass
+            if when != "while it arms":
+                await until(lambda: loop.tick.state.mode is Mode.MANUAL)
+            stood_deg.append(machine.rotation.position)
+
+        async def work() -> None:
+            async with Maneuver(loop) as blade:
+                if when == "under way":
+                    turning = asyncio.create_task(blade.rotate_to(40.0, 30.0))
+                    await until(lambda: machine.rotation.position > 2.0)
+                    await arm_it_anew()
+                    await turning
+                await blade.rotate_to(4.0, 2.0)
+                await arm_it_anew()
+                await blade.rotate_to(40.0, 30.0)
+
+        working = asyncio.create_task(work())
+        if when == "while it arms":
+            await until(lambda: loop.tick.state.arming_since_s is not None)
+            await arm_it_anew()
+        with pytest.raises((DeviceLostError, DeviceRefusedError)):
+            await working
+        # And it does not disarm what it did not arm.
+        await until(lambda: loop.tick.state.mode is Mode.MANUAL)
+        over_s = loop.tick.now_s + 3.0
+        await until(lambda: loop.tick.now_s > over_s)
+        assert loop.tick.state.mode is Mode.MANUAL
+        assert machine.rotation.position == pytest.approx(stood_deg[0], abs=0.5)
+
+
+@in_simulated_time
+async def test_a_machine_that_another_arms_in_the_same_tick_is_anothers(tmp_path: Path) -> None:
+    async with running(tmp_path) as (machine, loop):
+        theirs = asyncio.create_task(loop.command(cmd.Arm(client="cab")))
+        await asyncio.sleep(0)
+        with pytest.raises(DeviceLostError, match="cab has armed"):
+            await turn(loop, 40.0)
+        assert (await theirs).accepted
+        await until(lambda: loop.tick.state.mode is Mode.MANUAL)
+        assert machine.rotation.position == 0.0
 
 
 @pytest.mark.parametrize("why", ["a fault", "no measurement"])
@@ -204,7 +262,7 @@ async def test_automatic_operation_that_somebody_asks_for_while_it_arms_is_not_w
             """Before the maneuver sees that it is armed."""
             if loop.tick.state.mode is Mode.MANUAL and not asked:
                 asked.append(asyncio.get_running_loop().create_future())
-                loop._queue.append((cmd.Auto(client="cab"), asked[0]))
+                loop._queue.append(Queued(cmd.Auto(client="cab"), loop.tick.now_s, asked[0]))
                 loop.run_tick()
 
         loop.on_tick = ask_in_the_tick_that_armed

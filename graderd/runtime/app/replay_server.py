@@ -213,7 +213,7 @@ class Player:
             await self._shown.wait()
         return self.status()
 
-    async def command(self, command: Command) -> Reply:
+    async def command(self, command: Command, waited_s: float = 0.0) -> Reply:  # noqa: ARG002  (the port's)
         """Refused."""
         return Reply(command=command.command, accepted=False, message=NO_MACHINE, remedy="ask the daemon itself")
 
