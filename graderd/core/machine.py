@@ -282,7 +282,7 @@ def _obey(
         return no(stages, "ask for a position inside the limits")
     lease = Lease(command.client, heard_s + settings.lease_s)
     if inputs.now_s > lease.expires_s:
-        return no(f"asked {inputs.now_s - heard_s:.1f} s ago, and not renewed since", "ask again, and for less at once")
+        return no(f"asked {inputs.now_s - heard_s:.1f} s ago, and not renewed since", "send the jog again")
     moving = replace(state, goals=stages[0], later=stages[1:], lease=lease, reason=f"{command.command} by hand")
     return yes(moving, "moving while the lease is renewed")
 
