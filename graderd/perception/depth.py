@@ -146,8 +146,10 @@ class DepthJudge:
         # How much steep soil, and soil at its angle of repose, rises from cell to cell.
         self._steepest_m = math.tan(math.radians(settings.form.steepest_deg)) * self._cell_d_m
         self._repose_m = math.tan(math.radians(settings.repose_deg)) * self._cell_d_m
-        # Where the profile's parts begin and end, in rows of the map, the right end's first as the rows.
-        self._profile_rows = np.linspace(0.0, self._along_n, PROFILE_BINS_N + 1)
+        # How much of each row of the map lies before each of the profile's parts, the left end's first.
+        borders = np.linspace(0.0, self._along_n, PROFILE_BINS_N + 1)
+        rows = np.clip(borders[:, None] - np.arange(self._along_n), 0.0, 1.0)
+        self._profile_rows = np.ascontiguousarray(np.diff(rows, axis=0)[::-1])
         self._before = slice(self._beside_n, self._beside_n + self._along_n), slice(self._ahead_n)
 
     def height_map(self, depth_mm: DepthImage, stance: Stance) -> HeightMap:
@@ -398,15 +400,16 @@ class DepthJudge:
     def _profile_mm(self, soil_m: F64, seen: Bools) -> Profile:
         """The crest of the soil along the blade: the mean of the rows that lie before each part of it."""
         known = seen.any(axis=1)
-        rows = np.zeros((2, known.size + 1))
-        np.cumsum((np.maximum(soil_m, 0.0).max(axis=1) * known, known), axis=1, out=rows[:, 1:])
+        crests_m = soil_m.max(axis=1)
+        np.maximum(crests_m, 0.0, out=crests_m)
         # A part's border may cut a row in two: each has its share of it.
-        borders = np.arange(known.size + 1)
-        crests_m, known_n = (np.diff(np.interp(self._profile_rows, borders, sums)) for sums in rows)
+        sums_m, known_n = (self._profile_rows @ np.array((crests_m * known, known)).T).T
         enough = known_n >= 0.5 * known.size / PROFILE_BINS_N
-        heights_mm = np.round(1000.0 * crests_m / np.where(enough, known_n, 1.0), 1) + 0.0  # no -0
-        left_first = zip(heights_mm[::-1].tolist(), enough[::-1].tolist(), strict=True)
-        return tuple(height_mm if is_known else None for height_mm, is_known in left_first)
+        heights_mm = np.round(1000.0 * sums_m / np.where(enough, known_n, 1.0), 1) + 0.0  # no -0
+        return tuple(
+            height_mm if is_known else None
+            for height_mm, is_known in zip(heights_mm.tolist(), enough.tolist(), strict=True)
+        )
 
     def _split(self, height: F64, where: Bools, angle_deg: float) -> tuple[Litres, Litres, Litres]:
         """Litres per third of the map's cells ``where``: all before the blade, carried by it, and ahead of it."""
