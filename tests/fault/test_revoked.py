@@ -19,7 +19,7 @@ from graderd.tokens import Right, create_token
 from harness.api_daemon import free_port
 from tests.machine import Served, standing_machine
 
-pytestmark = pytest.mark.whole_machine
+pytestmark = [pytest.mark.whole_machine, pytest.mark.xdist_group("beside a machine")]
 
 STEP_DEG, DWELL_S = 50.0, 20.0
 MOVING_DEG_PER_S = 3.0

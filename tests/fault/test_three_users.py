@@ -29,8 +29,8 @@ from tests.machine import PICTURES
 from tests.unit.test_cli_offline import leaf_commands
 from tests.users import CONFIG, DAEMON, OPERATOR, ROOT, STATE, STRANGER, Machine, environment, three_users
 
-# One machine for all of them; none measures time.
-pytestmark = [pytest.mark.whole_machine, pytest.mark.xdist_group("a line"), pytest.mark.timeout(600)]
+# One machine for all of them; none measures time, so that it need not take its turn with whole machines.
+pytestmark = [pytest.mark.xdist_group("three users"), pytest.mark.timeout(600)]
 READY_S = 120.0
 POSE = "0.9,0.05,0.6,30,1,-1"
 USERS = (DAEMON, OPERATOR, STRANGER)

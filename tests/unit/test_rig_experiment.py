@@ -123,6 +123,7 @@ def test_what_is_no_experiment_is_refused(capsys: pytest.CaptureFixture[str], tm
 
 @pytest.mark.live
 @pytest.mark.whole_machine
+@pytest.mark.xdist_group("beside a machine")
 @pytest.mark.timeout(240)
 async def test_a_trial_goes_through_the_whole_daemon_and_is_measured(tmp_path: Path) -> None:
     """The others of its experiment are there already: only what is missing is driven."""
