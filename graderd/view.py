@@ -80,7 +80,7 @@ def fitting(text: str, columns_n: int) -> str:
     kept = kept.rstrip()
     # A number stands with its unit: "3.1" alone would say less than it did.
     words = kept.split(" ")
-    while len(words) > 1 and words[-1][-1:].isdigit():
+    while len(words) > 1 and words[-1].rstrip(",;:")[-1:].isdigit():
         words.pop()
     return " ".join(words).rstrip(" ,;:") + MARK
 

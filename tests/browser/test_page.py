@@ -425,7 +425,7 @@ def test_a_stranger_is_asked_for_a_token_once(cab: Cab) -> None:
 
 
 @pytest.mark.parametrize("language", ["en", "ko"])
-@pytest.mark.parametrize("width", [360, 1280])
+@pytest.mark.parametrize("width", [360, 800, 1280])
 def test_no_violation_of_axe_and_no_word_cut(cab: Cab, language: str, width: int) -> None:
     cab.manual()
     page = cab.page(viewport={"width": width, "height": 800}, locale="ko-KR" if language == "ko" else "en-GB")
