@@ -27,7 +27,9 @@ function line(draw, points, stroke, wide, dash = []) {
 }
 
 function words(draw, text, x, y, fill = color("ink"), align = "center") {
-  draw.textAlign = align; draw.fillStyle = fill; draw.fillText(text, x, y);
+  draw.textAlign = "left"; draw.fillStyle = fill;
+  const wide = draw.measureText(text).width, begin = x - { left: 0, center: wide / 2, right: wide }[align];
+  draw.fillText(text, Math.max(2, Math.min(draw.canvas.clientWidth - wide - 2, begin)), y);  // on a narrow sheet, too, no word is cut
 }
 
 /** The blade from above, travel upwards: requested dashed, limited dotted, measured solid, in its thirds' colours. */

@@ -25,6 +25,16 @@ SHOWN_NUMBERS = """[...document.querySelectorAll('[data-v], #jogs output')].map(
 CUT = """[...document.querySelectorAll('button, th, td, dd, dt, h2, label, #mode, #heard')]
     .filter((e) => e.offsetParent && e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).display !== 'inline')
     .map((e) => e.outerHTML.slice(0, 120))"""
+CUT_DRAWN = """new Promise((told) => {
+    const real = CanvasRenderingContext2D.prototype.fillText, cut = new Set();
+    CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
+        const { a, e } = this.getTransform(), { actualBoundingBoxLeft: l, actualBoundingBoxRight: r } = this.measureText(text);
+        if ((x - l) * a + e < -0.5 || (x + r) * a + e > this.canvas.width + 0.5) cut.add(`${this.canvas.id}: ${text}`);
+        real.call(this, text, x, y);
+    };
+    setTimeout(() => { CanvasRenderingContext2D.prototype.fillText = real; told([...cut]); }, 400);
+})"""
+"""Words that are drawn over the edge of their picture, within some frames."""
 PROFILE = """(() => {
     const { data } = document.getElementById('profile').getContext('2d').getImageData(0, 0, 10000, 10000);
     const kinds = { '10,107,44': 0, '11,79,158': 1, '168,50,10': 2 }, found = [0, 0, 0];
@@ -439,6 +449,7 @@ def test_no_violation_of_axe_and_no_word_cut(cab: Cab, language: str, width: int
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{view} is wider than the page"
         cut = page.evaluate(CUT)
         assert cut == []
+        assert page.evaluate(CUT_DRAWN) == [], f"{view} has words that go over the edge of their picture"
         assert page.evaluate("getComputedStyle(document.body).wordBreak") == "keep-all"
         small = page.evaluate(SMALL)
         assert small == [], "too small for a glove"
