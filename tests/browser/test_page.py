@@ -28,8 +28,9 @@ CUT = """[...document.querySelectorAll('button, th, td, dd, dt, h2, label, #mode
 CUT_DRAWN = """new Promise((told) => {
     const real = CanvasRenderingContext2D.prototype.fillText, cut = new Set();
     CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
-        const { a, e } = this.getTransform(), { actualBoundingBoxLeft: l, actualBoundingBoxRight: r } = this.measureText(text);
-        if ((x - l) * a + e < -0.5 || (x + r) * a + e > this.canvas.width + 0.5) cut.add(`${this.canvas.id}: ${text}`);
+        const { a, e } = this.getTransform(), box = this.measureText(text);
+        const left = (x - box.actualBoundingBoxLeft) * a + e, right = (x + box.actualBoundingBoxRight) * a + e;
+        if (left < -0.5 || right > this.canvas.width + 0.5) cut.add(`${this.canvas.id}: ${text}`);
         real.call(this, text, x, y);
     };
     setTimeout(() => { CanvasRenderingContext2D.prototype.fillText = real; told([...cut]); }, 400);
