@@ -42,8 +42,9 @@ class StereoNoise:
         mixed = 0.9 * smooth + 0.44 * white
         self._noise = np.asarray(mixed / mixed.std(), np.float32)
         blobs = noise(rng, shape, ((5.0, 1.0), (11.0, 0.8)))
-        ranks = np.argsort(np.argsort(blobs, axis=None)).reshape(shape)
-        self._blobs = np.asarray(ranks / blobs.size, np.float32)
+        ranks = np.empty(blobs.size)
+        ranks[np.argsort(blobs, axis=None)] = np.arange(blobs.size)
+        self._blobs = np.asarray((ranks / blobs.size).reshape(shape), np.float32)
 
     def measure(
         self,

@@ -42,20 +42,37 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], octaves: tuple[tuple
         field = rng.standard_normal(coarse, np.float32)
         if wavelength > 1:
             field = np.asarray(cv2.resize(field, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC), np.float32)
-        total += np.float32(weight) * field[: shape[0], : shape[1]]
+        field *= np.float32(weight)
+        total += field[: shape[0], : shape[1]]
     total -= total.mean()
-    return np.asarray(total / max(float(total.std()), 1e-6), np.float32)
+    total /= np.float32(max(float(total.std()), 1e-6))
+    return total
+
+
+def _sum(base: float, *fields: tuple[float, Image32]) -> Image32:
+    """``base`` and the weighted fields, which are used up: each is 10 MB, and what takes time is memory."""
+    (weight, total), *others = fields
+    total *= np.float32(weight)
+    total += np.float32(base)
+    for weight, field in others:
+        field *= np.float32(weight)
+        total += field
+    return total
+
+
+def _lightness(light: Image32) -> Image8:
+    return np.asarray(np.clip(light, 0, 255, out=light), np.uint8)
 
 
 def soil_grain(rng: np.random.Generator, shape: tuple[int, int]) -> Image8:
     """Lightness of a soil surface, 128 in the mean: grains, clods with their small shadows, damp patches."""
     clods = noise(rng, shape, ((5.0, 0.6), (10.0, 1.0), (22.0, 0.8)))
-    relief = clods - np.roll(clods, (2, 1), (0, 1))
-    relief /= max(float(relief.std()), 1e-6)
+    relief = np.roll(clods, (2, 1), (0, 1))
+    np.subtract(clods, relief, out=relief)
+    relief /= np.float32(max(float(relief.std()), 1e-6))
     fine = noise(rng, shape, ((1.0, 1.0), (2.0, 1.0)))
     patches = noise(rng, shape, ((90.0, 1.0), (220.0, 1.0)))
-    light = 128.0 + 22.0 * relief + 9.0 * fine + 7.0 * clods + 6.0 * patches
-    return np.asarray(np.clip(light, 0, 255), np.uint8)
+    return _lightness(_sum(128.0, (22.0, relief), (9.0, fine), (7.0, clods), (6.0, patches)))
 
 
 def wood_grain(rng: np.random.Generator, shape: tuple[int, int]) -> Image8:
@@ -64,10 +81,10 @@ def wood_grain(rng: np.random.Generator, shape: tuple[int, int]) -> Image8:
     fibres = np.asarray(cv2.resize(fibres, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC), np.float32)
     stains = noise(rng, shape, ((30.0, 0.6), (70.0, 1.0), (160.0, 1.0)))
     fine = noise(rng, shape, ((1.0, 1.0), (2.0, 1.0)))
-    board = 128.0 + 6.0 * fibres + 9.0 * stains + 5.0 * fine
+    board = _sum(128.0, (6.0, fibres), (9.0, stains), (5.0, fine))
     joint = np.arange(shape[0]) % 480 < 2
     board[joint] *= 0.55
-    return np.asarray(np.clip(board, 0, 255), np.uint8)
+    return _lightness(board)
 
 
 def palette(rgb: tuple[int, int, int], contrast: float, warm: float) -> Image8:
