@@ -181,6 +181,8 @@ class CanLink:
         self._tasks: list[asyncio.Task[None]] = []
         self._lost = asyncio.Event()
         self._opening = asyncio.Lock()
+        self._not_opened: DeviceError | None = None
+        self._boots_until_s = -math.inf
 
     # -- state ------------------------------------------------------------------------------------------------------
 
@@ -220,15 +222,23 @@ class CanLink:
     async def open(self) -> None:
         """Open the bus, claim our address and start the schedule; does nothing where that is done.
 
-        Afterwards the link keeps itself: a lost bus is closed at once and opened again with back-off.
+        Who asks while it is being opened for another waits for that, and is told what became of it. Afterwards the link
+        keeps itself: a lost bus is closed at once and opened again with back-off.
 
         Raises:
             DeviceMissingError: the channel does not exist, is down, or cannot be opened.
         """
+        before = self._not_opened
         async with self._opening:
             if self._tasks:
                 return
-            await self._open_port()
+            if self._not_opened is not None and self._not_opened is not before:
+                raise self._not_opened
+            try:
+                await self._open_port()
+            except DeviceError as error:
+                self._not_opened = error
+                raise
             self._tasks = [
                 asyncio.create_task(self._schedule(), name="can-schedule"),
                 asyncio.create_task(self._supervise(), name="can-supervisor"),
@@ -491,11 +501,13 @@ class CanLink:
         if self._factory is not None:
             port = self._factory()
         else:
+            await asyncio.sleep(max(0.0, self._boots_until_s - self._clock.now_s()))
             port = await asyncio.to_thread(open_port, self.settings)
             try:
                 await asyncio.to_thread(port.wait_ready, READY_S)
             except PortLostError as error:
                 port.close()
+                self._boots_until_s = self._clock.now_s() + READY_S  # opened once more it would only reset again
                 raise DeviceLostError(self.where, error.detail) from error
         now_s = self._clock.now_s()
         self._port = port

@@ -16,11 +16,13 @@ import pytest
 from graderd.drivers.electrak import CanLink, ElectrakActuator, dump, safe_off
 from graderd.drivers.j1939 import link as link_module
 from graderd.drivers.j1939.bus_health import BusEvent, event_of
-from graderd.drivers.j1939.can_port import PortLostError, SlcanPort, SocketCanPort, lost_from
+from graderd.drivers.j1939.can_port import BusPort, PortLostError, SlcanPort, SocketCanPort, lost_from
 from graderd.drivers.j1939.ids import Frame, Pgn, make_id, pgn_of
 from graderd.drivers.j1939.python_can import can
 from graderd.drivers.j1939.slcan_bus import QuietSlcanBus
+from graderd.hal.clock import SystemClock
 from graderd.hal.device import Lifecycle
+from graderd.hal.errors import DeviceLostError, DeviceMissingError
 from graderd.hal.settings import CanSettings, ElectrakSettings
 from graderd.simulator.actuators import VirtualActuatorBus, VirtualElectrak
 from graderd.simulator.actuators.slcan import SlcanAdapter
@@ -129,6 +131,45 @@ async def test_an_adapter_that_forgot_its_channel_is_opened_again(tmp_path: Path
         await until(lambda: bus.channel_open)
         await until(lambda: conditions(link) == set() and state(axis) is Lifecycle.STANDBY)
         assert link.counters.lost_n == 0
+
+
+async def test_four_who_open_a_bus_that_is_not_there_try_it_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The daemon and each of three actuators ask for it, all at the same time, and again after the same pause."""
+    tried_n = 0
+
+    def absent(settings: CanSettings) -> BusPort:
+        nonlocal tried_n
+        tried_n += 1
+        raise DeviceMissingError(f"CAN {settings.channel}", "no such interface")
+
+    monkeypatch.setattr(link_module, "open_port", absent)
+    link = CanLink(CanSettings())
+    for asked_n in (1, 2):
+        told = await asyncio.gather(*(link.open() for _ in range(4)), return_exceptions=True)
+        assert [type(error) for error in told] == [DeviceMissingError] * 4
+        assert tried_n == asked_n
+
+
+async def test_a_board_that_vanishes_while_it_boots_is_left_in_peace_before_it_is_opened_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    opened_s: list[float] = []
+
+    class Booting(BusPort):
+        def __init__(self, settings: CanSettings) -> None:
+            super().__init__(can.Bus(interface="virtual", channel=settings.channel))
+            opened_s.append(SystemClock().now_s())
+
+        def wait_ready(self, timeout_s: float) -> bool:
+            raise PortLostError("unplugged", f"hung up, within {timeout_s:g} s")
+
+    monkeypatch.setattr(link_module, "READY_S", 0.3)
+    monkeypatch.setattr(link_module, "open_port", Booting)
+    link = CanLink(CanSettings(channel="boots"))
+    for _ in range(2):
+        with pytest.raises(DeviceLostError):
+            await link.open()
+    assert opened_s[1] - opened_s[0] >= 0.3
 
 
 async def test_a_board_that_resets_when_its_port_is_opened_is_waited_for(tmp_path: Path) -> None:
