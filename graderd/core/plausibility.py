@@ -185,7 +185,7 @@ class _AxisWatch:
         self._velocity = self._gained = 0.0
         # held or settled at its goal: where it rests, once it does
         self._rest: float | None = None
-        self._held_since_s = self._settle_s = self._held_from = 0.0
+        self._held_since_s = self._settle_s = self._held_from = self._unseen = 0.0
         # driven
         self._goal: float | None = None
         self._goal_since_s = self._move_s = 0.0
@@ -228,6 +228,8 @@ class _AxisWatch:
         if last is None or (goal is None) != (self._goal is None) or s.powered != last.powered:
             self._rest = None
             self._held_since_s, self._held_from = now_s, s.position
+            # A reading of a bad line may be old: what the axis went on to its goal since was commanded.
+            self._unseen = self._figures.fastest * max(0.0, now_s - s.time_s)
             self._settle_s = self._figures.rest_s + self._figures.braking_s(abs(self._velocity))
             self._mark, self._mark_s = s.position, now_s
             self._direction = 0.0
@@ -271,7 +273,7 @@ class _AxisWatch:
         figures = self._figures
         rest, allowed = self._rest, figures.tolerance
         if rest is None:
-            rest, allowed = self._held_from, figures.overrun + figures.tolerance
+            rest, allowed = self._held_from, self._unseen + figures.overrun + figures.tolerance
         if self._displaced(s, rest, allowed, " without a command"):
             self._rest = s.position  # told again when it goes on, and over when it does not
         elif self._rest is None and s.time_s - self._held_since_s >= self._settle_s:

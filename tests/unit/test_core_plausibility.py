@@ -258,6 +258,22 @@ def test_a_runaway_faster_than_permitted_is_the_wrong_way_at_once() -> None:
 # -- uncommanded ------------------------------------------------------------------------------------------------------
 
 
+def test_what_was_turned_to_a_goal_since_an_old_reading_was_commanded() -> None:
+    """A stop on a bad line: nothing was heard for 0.4 s around it, and the blade went on to its goal for half of it."""
+    settings = Ph54Settings(speed_deg_per_s=40.0, acceleration_deg_per_s2=160.0)
+    config = Config(rotation=settings)
+    monitor = PlausibilityMonitor(motion_figures(settings, config.actuators(), config.figures()))
+    course, seen = ramp(40.0, to=50.0), set[str]()
+    for tick in range(200):
+        now_s = tick * TICK_S
+        at_s = 2.0 if 2.0 < now_s < 2.4 else now_s
+        goal = 90.0 if 1.0 <= now_s < 2.2 else None
+        sample = AxisSample("rotation", course(at_s), at_s, 40.0 if 1.0 < at_s < 2.25 else 0.0, goal, True)
+        seen |= {fault.condition for fault in monitor.judge((sample,), now_s)}
+    assert seen == set()
+
+
+
 @pytest.mark.parametrize("goal", [None, 0.0])
 @pytest.mark.parametrize("powered", [True, False])
 def test_moving_without_a_command_is_named(goal: float | None, powered: bool) -> None:
