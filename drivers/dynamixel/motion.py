@@ -42,33 +42,63 @@ def possible(before: ServoMotion, after: ServoMotion, top_deg_per_s: float) -> b
     return min(speeds) * took_s - slack_deg <= way_deg <= max(speeds) * took_s + slack_deg
 
 
+@dataclass(frozen=True, slots=True)
+class MoveProfile:
+    """How the servo goes to a goal: its profile's velocity and acceleration, of its output."""
+
+    deg_per_s: float
+    deg_per_s2: float
+
+    def speeds_up(self, deg_per_s: float, age_s: float) -> tuple[float, float]:
+        """The way made in that time towards a goal ahead, and the speed then; what an older reading does not vouch for
+        is not made up."""
+        gain_s = min(age_s, _HULL_S, max(0.0, self.deg_per_s - deg_per_s) / self.deg_per_s2)
+        faster = deg_per_s + self.deg_per_s2 * gain_s
+        return 0.5 * (deg_per_s + faster) * gain_s + faster * (age_s - gain_s), faster
+
+    def slows_down(self, deg_per_s: float, age_s: float) -> tuple[float, float]:
+        """The way made in that time on the way back to a goal behind, at most to where it turns, and the speed then."""
+        loss_s = min(age_s, max(0.0, deg_per_s) / self.deg_per_s2)
+        slower = deg_per_s - self.deg_per_s2 * loss_s
+        return 0.5 * (deg_per_s + slower) * loss_s, slower
+
+
 def rest_deg(
     motion: ServoMotion,
     now_s: float,
     braking_deg_per_s2: float,
     goal_deg: float | None,
+    move: MoveProfile,
     former_deg: float | None = None,
 ) -> float:
     """The goal that brings the servo to rest soonest without turning back: measured + v·age + the way to brake.
 
     The servo's set point may run ahead of what is measured: then its way to rest counts, or it would turn back.
-    ``goal_deg``: the goal the servo has, or may have; a hold never goes beyond one that lies ahead. ``former_deg``: of
-    a hold that may not have been taken; it is never pulled back from.
+    ``goal_deg``: the goal the servo has, or may have; a hold never goes beyond one that lies ahead. On its way there it
+    has changed its speed since the reading, as ``move`` lets it. ``former_deg``: of a hold that may not have been
+    taken; it is never pulled back from.
     """
     age_s, speed = max(0.0, now_s - motion.time_s), motion.velocity_deg_per_s
     if abs(speed) < _STILL_DEG_PER_S:
-        near = former_deg is not None and abs(former_deg - motion.position_deg) < 1.0
-        return former_deg if near and former_deg is not None else motion.position_deg
+        if former_deg is not None and abs(former_deg - motion.position_deg) < 1.0:
+            return former_deg
+        return motion.position_deg
     ahead = math.copysign(1.0, speed)  # from here on lengths count forward
+
+    goal_ahead = goal_deg is not None and ahead * goal_deg >= ahead * motion.position_deg
 
     def rests(position_deg: float, deg_per_s: float) -> float:
         forward = ahead * deg_per_s
-        return ahead * position_deg + forward * age_s + forward * abs(forward) / (2.0 * braking_deg_per_s2)
+        if goal_deg is None:
+            way_deg, then = forward * age_s, forward
+        else:
+            way_deg, then = (move.speeds_up if goal_ahead else move.slows_down)(forward, age_s)
+        return ahead * position_deg + way_deg + then * abs(then) / (2.0 * braking_deg_per_s2)
 
     far = rests(motion.position_deg, speed)
     if ahead * motion.setpoint_deg_per_s > 0.0:
         far = max(far, rests(motion.setpoint_deg, motion.setpoint_deg_per_s))
-    if goal_deg is not None and ahead * goal_deg >= ahead * motion.position_deg:
+    if goal_ahead and goal_deg is not None:
         far = min(far, ahead * goal_deg)
     if former_deg is not None:
         far = max(far, ahead * former_deg)

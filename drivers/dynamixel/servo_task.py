@@ -17,7 +17,7 @@ from graderd.drivers.dynamixel.calibration import Calibration
 from graderd.drivers.dynamixel.codec import StatusError
 from graderd.drivers.dynamixel.connection import ServoLink, condition_of
 from graderd.drivers.dynamixel.device import ATTEMPTS_N, Ph54Device
-from graderd.drivers.dynamixel.motion import ServoMotion, led_back_deg, rest_deg
+from graderd.drivers.dynamixel.motion import MoveProfile, ServoMotion, led_back_deg, rest_deg
 from graderd.drivers.dynamixel.observer import SUPPLY_FAULTS, ServoObserver
 from graderd.hal.clock import Clock
 from graderd.hal.device import Lifecycle
@@ -61,9 +61,13 @@ class CommandSlot:
             return
         self.goal_deg, self.hold_wanted, self._led_back = None, True, False
 
+    def withdraw(self) -> None:
+        """No command in force. What the servo has, or may have, stays known: the next hold goes by it."""
+        self.goal_deg, self.hold_wanted, self._holding, self._led_back = None, False, False, False
+
     def forget(self, sent_counts: int | None = None) -> None:
         """No command in force; ``sent_counts``: the goal that is on the servo, where that is known."""
-        self.goal_deg, self.hold_wanted, self._holding, self._led_back = None, False, False, False
+        self.withdraw()
         self._sent_counts, self._held_deg = sent_counts, None
 
     def armed(self, armed: arming.Armed) -> None:
@@ -87,7 +91,7 @@ class CommandSlot:
 
     def sent_hold_after(self, motion: ServoMotion) -> bool:
         """Whether a hold went out after that reading: the blade may brake since, and the reading not know of it."""
-        return self._held_deg is not None and motion.time_s < self._held_s
+        return self._held_deg is not None and motion.time_s <= self._held_s
 
     async def send_hold(self, device: Ph54Device, motion: ServoMotion, now_s: float, *, attempts_n: int = 1) -> int:
         """The goal where it comes to rest soonest, with a harder profile, in one packet. Returns the counts sent.
@@ -115,7 +119,7 @@ class CommandSlot:
                 raise
             counts = self._rest_counts(motion, now_s, gentle)
             await device.write("goal_position", counts, attempts_n=attempts_n, urgent=True)
-        self._holding, self.hold_wanted = True, False
+        self._sent_counts, self._holding, self.hold_wanted = counts, True, False
         return counts
 
     def _rest_counts(self, motion: ServoMotion, now_s: float, acceleration_counts: int) -> int:
@@ -123,7 +127,12 @@ class CommandSlot:
         braking = acceleration_counts * cal.acceleration_deg_per_s2_per_count
         goal_deg = None if self._sent_counts is None else cal.servo_deg(self._sent_counts)
         if self._held_deg is None or not self.sent_hold_after(motion):
-            self._held_deg, self._held_s = rest_deg(motion, now_s, braking, goal_deg, self._held_deg), now_s
+            profile = arming.profile_counts(self._settings, cal)
+            move = MoveProfile(
+                profile["profile_velocity"] * cal.velocity_deg_per_s_per_count,
+                profile["profile_acceleration"] * cal.acceleration_deg_per_s2_per_count,
+            )
+            self._held_deg, self._held_s = rest_deg(motion, now_s, braking, goal_deg, move, self._held_deg), now_s
         wanted = cal.servo_counts(self._held_deg)
         low, high = cal.servo_limits()
         counts = max(low, min(high, wanted))  # beyond them the servo would refuse
@@ -314,7 +323,7 @@ class ServoTask:
         A stranger's torque is left alone, and so is a servo that stands; one on its way somewhere holds first.
         """
         observer = self._observer
-        self._command.forget(self._command.sent_counts)
+        self._command.withdraw()
         off = self.torque_is_ours and self._settings.torque_at_disarm == "off"
         if observer.torque_on and self._on_its_way():
             await self._come_to_rest(device, off=off, wait=off)
@@ -373,7 +382,7 @@ class ServoTask:
                     await self._tolerant(self._hold(device))
             except DeviceRefusedError as e:
                 log.warning("%s: %s", DEVICE, e, extra=FIELDS)
-                self._command.forget(self._command.sent_counts)
+                self._command.withdraw()
                 if off:
                     break
             if not wait and not self._command.hold_wanted:

@@ -6,6 +6,7 @@ Every case turns the blade at its full speed, makes something fail, holds, and w
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import os
 import sys
@@ -17,8 +18,9 @@ from typing import Any
 import pytest
 
 from graderd.drivers.dynamixel import bus as servo_bus
+from graderd.drivers.dynamixel.servo_task import Event
 from graderd.hal.device import Lifecycle
-from graderd.hal.errors import DeviceRefusedError, LifecycleError
+from graderd.hal.errors import DeviceRefusedError, DeviceTimeoutError, LifecycleError
 from graderd.simulator.servo import VirtualServo
 from tests.dynamixel_sim import Bench, bench, standing
 
@@ -157,6 +159,25 @@ async def test_a_hold_whose_answer_is_lost_with_those_after_it(rig: Bench) -> No
     asyncio.get_running_loop().call_later(0.08, rig.bus.clear_faults)
     assert good(await stopped(rig, "no answer for 0.08 s"))
     assert rig.servo.shaft_deg - from_deg < 3.0
+
+
+async def test_a_hold_that_went_unanswered_is_not_forgotten_with_the_disarming_it_was_for(rig: Bench) -> None:
+    """Whoever arms again at once ends the disarming; what makes the servo safe then has no newer reading than from
+    before the hold, and by that one it would turn the blade on, up to its old goal."""
+    await under_way(rig)
+    task, device = rig.rotator._task, rig.rotator._link.device
+    async with task.wire_lock:
+        rig.bus.inject("drop")
+        task.note(Event.DISARMED)
+        rig.rotator.hold()
+        with contextlib.suppress(DeviceTimeoutError):
+            await task._hold(device)
+        held = rig.servo.memory["goal_position"]
+        with pytest.raises(DeviceTimeoutError):
+            await task._make_safe(device)
+        assert rig.servo.memory["goal_position"] == held
+        rig.bus.clear_faults()
+    await rig.until(lambda: not rig.servo.torque_enabled)
 
 
 async def test_holds_that_arrive_damaged_again_and_again(rig: Bench) -> None:
