@@ -6,7 +6,7 @@ import asyncio
 
 from graderd.core.attitude import MeasuredAttitude
 from graderd.core.soil import SoilObservation
-from graderd.hal.clock import ManualClock
+from graderd.hal.clock import Clock, ManualClock
 from graderd.hal.device import Lifecycle
 from graderd.hal.errors import CommandRangeError, DeviceError, DeviceMissingError, LifecycleError
 from graderd.hal.fault import DeviceFault
@@ -25,7 +25,7 @@ class FakeAxis:
     LIMIT = 400.0
     LOST = "no_reply"
 
-    def __init__(self, name: str, clock: ManualClock, position: float, log: list[str]) -> None:
+    def __init__(self, name: str, clock: Clock, position: float, log: list[str]) -> None:
         self.name = name
         self.clock = clock
         self.position = position
@@ -124,7 +124,7 @@ class FakeRotator(FakeAxis):
 
     SPEED, RENEWED_S = 25.0, 0.2
 
-    def __init__(self, name: str, clock: ManualClock, position: float, log: list[str]) -> None:
+    def __init__(self, name: str, clock: Clock, position: float, log: list[str]) -> None:
         super().__init__(name, clock, position, log)
         self.moved_s = clock.now_s()
 

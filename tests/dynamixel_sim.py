@@ -18,6 +18,7 @@ import pytest
 from graderd.config import Config
 from graderd.core.plausibility import PlausibilityMonitor, axis_sample, motion_figures
 from graderd.drivers.dynamixel import Ph54Rotator
+from graderd.hal.clock import Clock
 from graderd.hal.device import Lifecycle
 from graderd.hal.settings import Ph54Settings
 from graderd.simulator.servo import VirtualServo, VirtualServoBus
@@ -34,7 +35,7 @@ class Bench:
     rotator: Ph54Rotator
     servo: VirtualServo
     bus: VirtualServoBus
-    clock: AwakeClock
+    clock: Clock
     monitor: PlausibilityMonitor
 
     def conditions(self) -> set[str]:
@@ -114,11 +115,12 @@ async def bench(
     *,
     opened: bool = True,
     wire: dict[str, Any] | None = None,
+    clock: Clock | None = None,
     **changes: Any,
 ) -> AsyncIterator[Bench]:
     """A virtual servo at ``folder/servo`` and a rotator on it, opened unless told otherwise; all closed at the end."""
     servo = servo or VirtualServo()
-    clock = AwakeClock()
+    clock = clock or AwakeClock()
     bus = VirtualServoBus([servo], folder / "servo", clock=clock, **(wire or {}))
     brisk = {"speed_deg_per_s": 50.0, "acceleration_deg_per_s2": 200.0}  # so that tests need not wait for the blade
     # Without a processor to spare seven answers in a row are held back: whoever tests a lost servo says when it is one.

@@ -44,6 +44,7 @@ class VirtualServoBus:
         byte_gap_s: a longer pause inside a packet drops it (the servo: 1.5 ms; hosts and ptys do not keep that).
         answer_crc_errors: reply CRC Error to a damaged instruction packet instead of silence.
         linger_s: after a reply keep looking for the next request so long without sleeping (benchmarks).
+        heard: called with the client's bytes as they come, before anything is made of them or goes wrong with them.
         seed: for faults that strike with a probability.
     """
 
@@ -59,6 +60,7 @@ class VirtualServoBus:
         byte_gap_s: float = 0.1,
         answer_crc_errors: bool = False,
         linger_s: float = 0.0,
+        heard: Callable[[bytes], None] | None = None,
         seed: int = 0,
     ) -> None:
         if len({s.servo_id for s in servos}) != len(servos) or not servos:
@@ -73,6 +75,7 @@ class VirtualServoBus:
         self._byte_gap_s = byte_gap_s
         self._answer_crc_errors = answer_crc_errors
         self._linger_s = linger_s
+        self._heard = heard
         self._clock: Clock = clock or SystemClock()
         self._random = random.Random(seed)
         self._faults: dict[str, dict[str, float]] = {}
@@ -258,6 +261,8 @@ class VirtualServoBus:
 
     def _receive(self, data: bytes) -> None:
         now_s = self._clock.now_s()
+        if self._heard is not None:
+            self._heard(data)
         if "echo" in self._faults:
             self._put(data)
         if self._strict_baud and self._terminal and baud_of(self._terminal.slave) != self.baud_n:
