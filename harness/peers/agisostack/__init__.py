@@ -1,0 +1,1 @@
+"""AgIsoStack++ on our bus; ``python -m harness.peers.agisostack`` compiles and runs it."""
