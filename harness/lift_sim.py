@@ -56,9 +56,9 @@ class LiftMachine:
         self.clock, self.machine = clock, machine
         self.units: dict[str, VirtualElectrak] = {name: machine.units[name] for name in LIFTS}
         devices = Devices(
-            rotation=FakeRotator("rotation", clock, 0.0, log),  # type: ignore[arg-type]
+            rotation=FakeRotator("rotation", clock, 0.0, log),
             link=machine.link,
-            actuators={**{name: machine.axes[name] for name in LIFTS}, "tilt": FakeActuator("tilt", clock, 50.0, log)},  # type: ignore[arg-type]
+            actuators={**{name: machine.axes[name] for name in LIFTS}, "tilt": FakeActuator("tilt", clock, 50.0, log)},
         )
         self.loop = ControlLoop(config, devices, FakeEyes(), clock, StateFile(""))
 

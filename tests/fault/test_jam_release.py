@@ -33,7 +33,7 @@ async def test_a_jam_that_frees_does_not_leap(tmp_path: Path) -> None:
     async with bench(tmp_path, **turning) as rig:
         log: list[str] = []
         actuators = {
-            name: FakeActuator(name, rig.clock, position, log)  # type: ignore[arg-type]
+            name: FakeActuator(name, rig.clock, position, log)
             for name, position in (("lift_left", 100.0), ("lift_right", 100.0), ("tilt", 50.0))
         }
         devices = Devices(rotation=rig.rotator, link=FakeLink(), actuators=actuators)  # type: ignore[arg-type]

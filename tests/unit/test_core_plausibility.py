@@ -273,7 +273,6 @@ def test_what_was_turned_to_a_goal_since_an_old_reading_was_commanded() -> None:
     assert seen == set()
 
 
-
 @pytest.mark.parametrize("goal", [None, 0.0])
 @pytest.mark.parametrize("powered", [True, False])
 def test_moving_without_a_command_is_named(goal: float | None, powered: bool) -> None:

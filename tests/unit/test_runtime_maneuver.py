@@ -45,7 +45,7 @@ async def running(tmp_path: Path, config: Config | None = None) -> AsyncIterator
     clock = asyncio.get_running_loop()
     assert isinstance(clock, SimulatedLoop)
     for device in (machine.rotation, machine.lift_left, machine.lift_right, machine.tilt):
-        device.clock = clock  # type: ignore[assignment]  # the fakes only read it
+        device.clock = clock
     loop = ControlLoop(config or Config(), machine.devices, machine.eyes, clock, StateFile(str(tmp_path)))
     task = asyncio.create_task(loop.run(), name="control-tick")
     try:
