@@ -24,7 +24,8 @@ INTERFACE_EXAMPLES ?= 100
 
 # Tests start a hundred processes: byte code is kept, in .venv, whatever the shell says of it (it is half of a start).
 # numpy with a thread of its own for each test, as the command line has it.
-TESTS  := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX=$(abspath $(VENV))/byte-code OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -p tests.run_times
+BYTE_CODE := $(VENV)/byte-code
+TESTS  := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX=$(abspath $(BYTE_CODE)) OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -p tests.run_times
 BESIDE := -n 2 --dist loadgroup
 # Three quarters of these tests' time is waiting, for virtual devices that move in real time.
 WAITING := -n 5 --dist loadgroup
@@ -79,16 +80,20 @@ $(STAMP): $(LOCKED) pyproject.toml
 run: $(STAMP) ## drive the demonstration on the simulated grader (ARGS=--json for one object a line)
 	@$(BIN)/graderd demo $(ARGS)
 
-test: $(STAMP) ## run the tests; run times by file at the end of each part
+# Made once, before seven processes that would each make all of it; what cannot be collected, the tests tell.
+$(BYTE_CODE): | $(STAMP)
+	@$(TESTS) --collect-only -q >/dev/null 2>&1 || true
+
+test: $(STAMP) | $(BYTE_CODE) ## run the tests; run times by file at the end of each part
 	@$(IDLE) $(TESTS) $(BESIDE) -m pure $(or $(PYTEST_ARGS),tests/unit) >$(VENV)/pure.log 2>&1 & pure=$$!; \
 	$(TESTS) $(WAITING) -m "not whole_machine and not pure" $(PYTEST_ARGS); waiting=$$?; \
 	$(TESTS) $(MACHINES) -m whole_machine $(PYTEST_ARGS); whole=$$?; \
 	wait $$pure; pure=$$?; cat $(VENV)/pure.log; [ $$waiting -eq 0 ] && [ $$whole -eq 0 ] && [ $$pure -eq 0 ]
 
-unit: $(STAMP) ## run the pure tests: no process, no socket, seconds
+unit: $(STAMP) | $(BYTE_CODE) ## run the pure tests: no process, no socket, seconds
 	@$(TESTS) $(BESIDE) -m "pure and not slow" $(PYTEST_ARGS) tests/unit
 
-quick: $(STAMP) ## run the tests of functions, contracts and wires that take no ten seconds each
+quick: $(STAMP) | $(BYTE_CODE) ## run the tests of functions, contracts and wires that take no ten seconds each
 	@$(TESTS) $(BESIDE) -m "not whole_machine and not slow" $(PYTEST_ARGS) tests/unit tests/contract tests/wire
 
 peers: $(STAMP) ## lerobot on the virtual servo, in an environment of its own (downloads it once; needs Python 3.12)
