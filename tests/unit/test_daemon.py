@@ -50,7 +50,7 @@ async def test_a_camera_child_that_cannot_be_started_for_want_of_files_is_tried_
     assert "perception failed and is started again: [Errno 24] Too many open files" in caplog.text
 
 
-async def test_a_proc_that_cannot_be_read_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_proc_that_cannot_be_read_ends_nothing() -> None:
     looks_n, enough = 0, asyncio.Event()
 
     def unreadable() -> float:
@@ -60,8 +60,7 @@ async def test_a_proc_that_cannot_be_read_ends_nothing(monkeypatch: pytest.Monke
             enough.set()
         raise PermissionError(errno.EACCES, "Permission denied", "/proc/self/statm")
 
-    monkeypatch.setattr("graderd.runtime.health._resident_mb", unreadable)
-    task = asyncio.create_task(keep_running("health", HealthWatch(Config()).run))
+    task = asyncio.create_task(keep_running("health", HealthWatch(Config(), unreadable).run))
     async with asyncio.timeout(5):
         await enough.wait()
     assert not task.done()
