@@ -38,11 +38,13 @@ export class Picture {
 
   async next() {
     try {
+      const asked_ms = performance.now();
       const answer = await fetch(`/v1/preview.jpg?labels=false&width_px=${WIDTHS_PX[this.width]}`, { cache: "no-store", signal: AbortSignal.timeout(4000) });
       if (!answer.ok) return false;
       const age_ms = 1000 * Number(answer.headers.get("Picture-Age-S"));
-      const answered_ms = performance.now(), image = await createImageBitmap(await answer.blob());
-      this.taken_ms = answered_ms - age_ms;
+      const making_ms = Number(/dur=([\d.]+)/.exec(answer.headers.get("Server-Timing"))?.[1] ?? 0);
+      const image = await createImageBitmap(await answer.blob());
+      this.taken_ms = asked_ms + making_ms - age_ms;  // the rest of the wait lay on the way: as old as it can be
       if (this.canvas.width !== image.width) { this.canvas.width = image.width; this.canvas.height = image.height; }
       const draw = this.canvas.getContext("2d"), mirrored = document.getElementById("mirror").checked;
       draw.setTransform(mirrored ? -1 : 1, 0, 0, 1, mirrored ? image.width : 0, 0);

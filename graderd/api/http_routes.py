@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import OrderedDict
 from collections.abc import Coroutine
 from enum import IntEnum
@@ -52,6 +53,11 @@ is this body, every further one renews the lease, the last that comes is `{"resu
 the blade holds, when the connection ends or is silent for half a second."""
 PICTURE_AGE = "Picture-Age-S"
 PICTURE_AGE_SCHEMA = {"description": "seconds since the picture was taken", "schema": {"type": "number"}}
+TIMING = "Server-Timing"
+TIMING_SCHEMA = {
+    "description": "how long the answer was made (`answer;dur=MS`); what else a client waited, it lay on its way",
+    "schema": {"type": "string"},
+}
 UPGRADE = "open it as a WebSocket, or use the client or 'graderd'"
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -151,7 +157,7 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: 
         summary="The newest picture with the three zones drawn on it",
         response_class=Response,
         responses={
-            200: {"content": {"image/jpeg": {}}, "headers": {PICTURE_AGE: PICTURE_AGE_SCHEMA}},
+            200: {"content": {"image/jpeg": {}}, "headers": {PICTURE_AGE: PICTURE_AGE_SCHEMA, TIMING: TIMING_SCHEMA}},
             404: {"model": Problem, "description": "no picture yet"},
         },
     )
@@ -159,13 +165,13 @@ def http_routes(port: DaemonPort, limits: ApiLimits, texts: StatusTexts, stops: 
         labels: Annotated[bool, Query(description="with names and numbers in the picture, not lines alone")] = True,
         width_px: Annotated[Width | None, Query(description="no wider than that; none: as the camera gives it")] = None,
     ) -> Response:
+        asked_s = time.monotonic()
         try:
             picture, age_s = await port.preview_jpeg(labels=labels, width_px=width_px)
         except ServiceError as error:
             raise ProblemError(404, error.message, "preview", error.remedy) from error
-        return Response(
-            picture, media_type="image/jpeg", headers={"Cache-Control": "no-store", PICTURE_AGE: f"{age_s:.3f}"}
-        )
+        told = {PICTURE_AGE: f"{age_s:.3f}", TIMING: f"answer;dur={(time.monotonic() - asked_s) * 1e3:.1f}"}
+        return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "no-store", **told})
 
     for name, offered in port.services().items():
         _add_service(router, port, name, offered)

@@ -7,11 +7,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import CDPSession, Page, expect
+from playwright.sync_api import CDPSession, Page, Route, expect
 
 from graderd.tokens import Right
 from tests.browser.conftest import Cab, shot
@@ -36,6 +37,12 @@ CUT_DRAWN = """new Promise((told) => {
     setTimeout(() => { CanvasRenderingContext2D.prototype.fillText = real; told([...cut]); }, 400);
 })"""
 """Words that are drawn over the edge of their picture, within some frames."""
+AGES = """new Promise((told) => {
+    const said = document.getElementById('picture-age'), ages_s = [];
+    const looking = setInterval(() => ages_s.push(Number(/[\\d.]+/.exec(said.textContent)[0])), 100);
+    setTimeout(() => { clearInterval(looking); told(ages_s); }, 5000);
+})"""
+"""The picture's age as it is told, through five seconds."""
 PROFILE = """(() => {
     const { data } = document.getElementById('profile').getContext('2d').getImageData(0, 0, 10000, 10000);
     const kinds = { '10,107,44': 0, '11,79,158': 1, '168,50,10': 2 }, found = [0, 0, 0];
@@ -162,6 +169,25 @@ def test_a_camera_that_is_unplugged_is_told_with_its_remedy_and_its_picture_goes
     cab.rig("clear_faults")
     page.click("#tab-work")
     expect(page.locator("#picture:not([data-old])")).to_be_visible(timeout=20_000)
+
+
+def test_a_picture_that_lay_on_its_way_is_as_old_as_that(cab: Cab) -> None:
+    """A link that hands it over late says nothing of it: its age counts the way."""
+    page = cab.page()
+    expect(page.locator("#picture:not([data-old])")).to_be_visible()
+
+    def late(route: Route) -> None:
+        answer = route.fetch()
+        time.sleep(1.2)
+        route.fulfill(response=answer)
+
+    page.route("**/v1/preview.jpg*", late)
+    expect(page.locator("#picture[data-old]")).to_be_visible()
+    ages_s = page.evaluate(AGES)
+    page.unroute_all(behavior="ignoreErrors")
+    assert min(ages_s) > 1.0, "never told as new"
+    assert min(after_s - before_s for before_s, after_s in pairwise(ages_s)) < -0.5, "newer ones came"
+    expect(page.locator("#picture:not([data-old])")).to_be_visible()
 
 
 def test_what_is_not_heard_is_not_shown(cab: Cab) -> None:
