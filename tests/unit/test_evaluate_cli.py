@@ -26,7 +26,7 @@ from graderd.record.frames import Judged, messages_of
 from graderd.simulator.camera.top import TopCamera, save
 from harness.top_view import HALF_VIEW, heap, trapezoid
 
-pytestmark = pytest.mark.xdist_group("evaluate cli")  # one set of scans for all
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("evaluate cli")]  # one set of scans for all
 
 Captured = pytest.CaptureFixture[str]
 GUIDE = Path(__file__).parents[2] / "docs" / "operators" / "evaluation.md"

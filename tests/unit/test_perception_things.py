@@ -25,6 +25,8 @@ from graderd.simulator.grader.soil import SoilField
 from harness.perception_scenes import ON_GROUND
 from harness.perception_things import COLOR_SIZE, DEPTH_SIZE, SIDES, VEHICLE_X_M, photograph
 
+pytestmark = pytest.mark.slow
+
 
 @functools.cache
 def renderer() -> Renderer:

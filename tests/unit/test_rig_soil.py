@@ -16,6 +16,8 @@ from graderd.simulator.grader.load import blade_load
 from graderd.simulator.grader.piles import SceneZone, heap, lay_scene, layer
 from graderd.simulator.grader.soil import MOIST_LOAM, FloatArray, SoilField
 
+pytestmark = pytest.mark.slow
+
 X_M = 3.0
 
 
