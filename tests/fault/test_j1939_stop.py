@@ -138,6 +138,10 @@ async def test_a_disable_that_was_lost_is_said_again_until_the_actuator_stands(
     lost_s = loop.now_s()
     end = out_claim_everything(machine)
     assert await standstill(machine, lost_s) <= 0.45
+    # It would stand by then without a further word, at the short target that it has.
+    said_again_s, said_again = commands(machine, deaf_until_s)[0]
+    assert said_again_s - deaf_until_s <= 0.11
+    assert not enabled(said_again)
     end()
 
 
