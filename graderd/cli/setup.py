@@ -24,7 +24,7 @@ from graderd.cli.asking import Answers, agree, answered_by, ask, choice, numbere
 from graderd.cli.console import DEFAULT_CONFIG, CliError, ExitCode, client_of, example, print_text
 from graderd.cli.setup_daemon import SetupDaemon, is_running
 from graderd.client import Client, RefusedError
-from graderd.core.axes import LIFTS
+from graderd.core.axes import ACTUATORS, LIFTS
 
 if TYPE_CHECKING:
     from graderd.commissioning import Commissioning
@@ -40,7 +40,6 @@ SQUARE_DEG: Final = 20.0
 CLEAR_MM: Final = 40.0
 ABOVE_MM: Final = 5.0
 UNPLUG: Final = "unplug"
-ACTUATORS: Final = (*LIFTS, "tilt")
 QUESTIONS: Final = (
     ("servo.port", "the servo's adapter: path, number in the list, or 'unplug'"),
     ("can.channel", "the actuators' bus: interface, port of an slcan adapter, or number in the list"),
