@@ -15,8 +15,8 @@ GroundKind = Literal["plywood", "earth", "concrete"]
 
 @dataclass(frozen=True, slots=True)
 class Appearance:
-    """How the scene is lit and what it is made of. Plain: the camera's process starts in half the time without
-    pydantic."""
+    """How the scene is lit and what it is made of. Plain data: with pydantic for it, the camera's process takes three
+    quarters longer to import what it needs."""
 
     sun_azimuth_deg: float = 35.0
     """Where the light comes from, seen from the blade: 0 = from ahead, 90 = from the left."""

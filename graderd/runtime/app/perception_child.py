@@ -181,7 +181,7 @@ class Worker:
         if former is not None:
             former.end()
         if wanted.path:
-            # Loaded late: it brings the whole of a recording with it, half of what a child takes to start.
+            # Loaded late: it brings the whole of a recording with it, a quarter of what a child takes to start.
             from graderd.record.frames import FrameRecorder
 
             self._recorder = FrameRecorder(wanted)
