@@ -33,6 +33,7 @@ class Mode(StrEnum):
 
 ARMED = (Mode.MANUAL, Mode.AUTO)
 STANDSTILLS = ("daemon.suspended", "daemon.loop_blocked")
+LATE = "daemon.tick_overrun"
 NOTHING_HELD: Mapping[str, str] = MappingProxyType({})
 
 
@@ -178,10 +179,10 @@ def _react(state: State, inputs: Inputs) -> State:
     fault = worst(inputs.faults)
     if fault is not None and fault.row.reaction >= Reaction.DISARM:
         if state.mode is not Mode.DISARMED or state.arming_since_s is not None:
-            return _disarmed(state, _own_standstill(inputs) or f"{fault.name}: {fault.row.reads}")
+            return _disarmed(state, _why_lost(inputs, f"{fault.name}: {fault.row.reads}"))
         return state
     if state.mode in ARMED and not inputs.devices_active:
-        return _disarmed(state, _own_standstill(inputs) or "a device left its active state")
+        return _disarmed(state, _why_lost(inputs, "a device left its active state"))
     if fault is not None and fault.row.reaction is Reaction.RETREAT and state.mode is Mode.AUTO:
         return _manual(state, f"{fault.name}: {fault.row.reads}")
     return state
@@ -198,10 +199,13 @@ def _react_stopping(state: State, stopping: list[ActiveFault]) -> State:
     return state if present == state.stopping else replace(state, stopping=present)
 
 
-def _own_standstill(inputs: Inputs) -> str:
-    """Why devices seem lost just after the daemon itself stood still; empty where it did not. Their silence is its own
-    deafness: nobody needs to look at their power for that, and a device that is really lost is told afterwards."""
-    return next((f"{f.name}: {f.row.reads}" for f in inputs.faults if f.present and f.name in STANDSTILLS), "")
+def _why_lost(inputs: Inputs, told: str) -> str:
+    """Why devices seem lost, where the daemon itself stood still just before: their silence is its own deafness, nobody
+    needs to look at their power for that, and a device that is really lost is told afterwards. Where it was only late,
+    either may be the cause: both are said."""
+    own = {f.name: f"{f.name}: {f.row.reads}" for f in inputs.faults if f.present}
+    standstill = next((own[name] for name in STANDSTILLS if name in own), "")
+    return standstill or (f"{told}; also: {own[LATE]}" if LATE in own else told)
 
 
 def _lapse(state: State, now_s: float) -> State:

@@ -205,6 +205,19 @@ async def test_after_a_freeze_the_reason_is_the_freeze(bench: Bench) -> None:
     assert {"daemon.loop_blocked", "rotation.no_reply"} <= {fault.name for fault in bench.loop.tick.faults}
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.4])
+async def test_after_a_late_tick_the_reason_names_it_beside_the_loss(bench: Bench, late_s: float) -> None:
+    """Longer than a feedback may fail to come, and no standstill yet: the daemon was deaf, or the device is lost."""
+    await bench.arm()
+    bench.machine.clock.advance(late_s)
+    bench.machine.rotation.lose()
+    bench.loop.run_tick(late_s)
+    assert bench.loop.tick.state.mode is Mode.DISARMED
+    lost, _, late = bench.loop.tick.state.reason.partition("; also: ")
+    assert lost.startswith("rotation.no_reply: ")
+    assert late == ("daemon.tick_overrun: the control tick came late" if late_s else "")
+
+
 async def test_a_lease_counts_from_when_the_command_was_heard(bench: Bench) -> None:
     await bench.arm()
     asked = asyncio.create_task(bench.loop.command(cmd.Jog(axis="rotate", value=20.0, client="a"), waited_s=0.1))
