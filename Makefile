@@ -34,7 +34,7 @@ MACHINES := -n 2 --dist loadgroup
 # What only computes takes what others leave of the processors, and is not missed by them.
 IDLE   := nice -n 19 env
 
-.PHONY: help run test unit quick passes peers test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb web-test web-lock study study-test study-lock interface bench-hw check format lock clean mutants mutants-wide claims core-coverage
+.PHONY: help run test unit quick passes peers peer-agisostack test-pythons faults deb hil soak soak-virtual-time monitor hil-package hil-arm64 hil-usb web-test web-lock study study-test study-lock interface bench-hw check format lock clean mutants mutants-wide claims core-coverage
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 20
@@ -102,6 +102,9 @@ peers: $(STAMP) ## lerobot on the virtual servo, in an environment of its own (d
 	&& var/peers/lerobot/bin/python -m pip install --quiet --no-deps lerobot==0.6.1 \
 	&& var/peers/lerobot/bin/python -m pip install --quiet deepdiff draccus dynamixel-sdk huggingface-hub numpy pyserial tqdm; }
 	@$(TESTS) $(PYTEST_ARGS) tests/wire/test_dynamixel_lerobot.py
+
+peer-agisostack: $(STAMP) ## AgIsoStack++ on the virtual bus, compiled here (downloads it once; needs git, cmake and a C++ compiler)
+	@$(BIN)/python -m harness.peers.agisostack --build var/peers/agisostack
 
 test-pythons: $(PYTHONS:%=test-python-%) ## both commands on each Python that README names, one after the other
 

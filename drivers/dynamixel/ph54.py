@@ -132,9 +132,9 @@ class Ph54Rotator:
             raise DeviceRefusedError(
                 DEVICE, "whole turns were lost, the angle is ambiguous", "Check the blade, then confirm the turns"
             )
-        if "wrong_device" in self._observer.faults.names(self._clock.now_s()):
-            cause = f"two servos answer to id {self.settings.servo_id_n}"
-            raise DeviceRefusedError(DEVICE, cause, "Give one of them another id")
+        for fault in self._observer.faults.present(self._clock.now_s()):
+            if fault.condition in LINK_FAULTS:  # a stop would have to pass that line
+                raise DeviceRefusedError(DEVICE, f"{fault.condition}: {fault.detail}", "Mend the line, then arm")
         async with self._task.wire_lock:
             self._require(Lifecycle.STANDBY)
             device = self._link.device

@@ -118,6 +118,16 @@ async def test_a_second_servo_with_the_id_is_told_at_work_and_nothing_arms_on_it
     await rig.rotator.arm()
 
 
+async def test_nothing_arms_on_a_line_that_damages_what_is_said(rig: Bench) -> None:
+    rig.bus.inject("flip", rate=0.3)
+    await rig.until(lambda: "corrupt_replies" in rig.conditions())
+    with pytest.raises(DeviceRefusedError, match="corrupt_replies"):
+        await rig.rotator.arm()
+    rig.bus.clear_faults()
+    await rig.until(lambda: not rig.conditions())
+    await rig.rotator.arm()
+
+
 async def test_late_answers_are_no_second_servo(rig: Bench) -> None:
     told = set[str]()
     for delay_s in (0.0, 0.08, 0.0, 0.03, 0.0):

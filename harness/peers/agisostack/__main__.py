@@ -177,7 +177,7 @@ async def drive(axis: ElectrakActuator) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(prog="harness.peers.agisostack", description=__doc__)
     parser.add_argument("--source", type=Path, help="AgIsoStack++ that is here already")
-    parser.add_argument("--build", type=Path, default=Path("build/agisostack"), help="what is fetched and compiled")
+    parser.add_argument("--build", type=Path, default=Path("var/peers/agisostack"), help="what is fetched and compiled")
     options = parser.parse_args()
     source = options.source or fetched(options.build / "source")
     program = compiled(source, options.build / "program")
