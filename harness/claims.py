@@ -698,10 +698,18 @@ CLAIMS: Final = (
     Mutant(
         "I16-own-standstill",
         "graderd/core/machine.py",
-        'if f.present and f.name in STANDSTILLS), "")',
-        'if False), "")',
+        "for name in STANDSTILLS if name in own",
+        "for name in STANDSTILLS if False",
         (CONTROL + "test_after_a_freeze_the_reason_is_the_freeze",),
         "after a freeze a person is sent to a device that is well",
+    ),
+    Mutant(
+        "I16-own-lateness",
+        "graderd/core/machine.py",
+        "if LATE in own else told)",
+        "if False else told)",
+        (CONTROL + "test_after_a_late_tick_the_reason_names_it_beside_the_loss",),
+        "after a late tick a person is sent to a device that is well",
     ),
     Mutant(
         "I16-flapping",
