@@ -53,7 +53,9 @@ def installed(machine: Machine) -> str:
     """A copy of the configuration as it was installed, but for its pictures, which nobody here measures."""
     kept = "/run/installed.toml"
     machine.must(ROOT, "cp", "-p", CONFIG, kept)
-    few = merged(machine.must(ROOT, "cat", CONFIG), tomllib.loads(PICTURES))
+    # Depth stays as large as it comes: a calibration is made from it.
+    camera = {key: value for key, value in tomllib.loads(PICTURES)["camera"].items() if not key.startswith("depth_")}
+    few = merged(machine.must(ROOT, "cat", CONFIG), {"camera": camera})
     assert machine.python(ROOT, f"open({kept!r}, 'w').write({few!r})").returncode == 0
     return kept
 
