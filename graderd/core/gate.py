@@ -99,12 +99,13 @@ def pass_gate(
     ``pace_lifts``: where the lifts go in this tick, on their way to the goals that it is handed.
     """
     dt_s = min(inputs.dt_s, LONGEST_STEP_S)
-    formers = {axis: _former(state, axis, inputs) for axis in AXES}
-    passed = {axis: _permit(axis, goals[axis], formers[axis], inputs) for axis in AXES}
+    pose = dict(inputs.pose.items())
+    formers = {axis: _former(state.setpoints.get(axis), measured, inputs.mode) for axis, measured in pose.items()}
+    passed = {axis: _permit(axis, goal, formers[axis], pose[axis], inputs) for axis, goal in goals.items()}
     paced = pace_lifts(Goals(lift_left_mm=passed["lift_left"].bounded, lift_right_mm=passed["lift_right"].bounded))
     setpoints: dict[str, Setpoint] = {}
     for axis in AXES:
-        result, measured, former = passed[axis], inputs.pose[axis], formers[axis]
+        result, measured, former = passed[axis], pose[axis], formers[axis]
         if former is None:
             continue
         wanted = paced[axis] if axis in LIFTS else result.bounded
@@ -130,20 +131,20 @@ def pass_gate(
     return GateState(setpoints), passed
 
 
-def _former(state: GateState, axis: str, inputs: GateInputs) -> Setpoint | None:
+def _former(former: Setpoint | None, measured: float | None, mode: Mode) -> Setpoint | None:
     """The axis's setpoint, made from where it stands as soon as it is armed; None: there is none, it holds."""
-    if inputs.mode not in ARMED:
+    if mode not in ARMED:
         return None
-    measured = inputs.pose[axis]
-    former = state.setpoints.get(axis)
     if former is None and measured is not None and math.isfinite(measured):
         return Setpoint(measured, 0.0, measured)
     return former
 
 
-def _permit(axis: str, requested: float | None, former: Setpoint | None, inputs: GateInputs) -> AxisPass:
+def _permit(
+    axis: str, requested: float | None, former: Setpoint | None, measured: float | None, inputs: GateInputs
+) -> AxisPass:
     """Whether the axis may move at all, and how far."""
-    refusal = _refusal(axis, requested, inputs.pose[axis], inputs)
+    refusal = _refusal(axis, requested, measured, inputs)
     if refusal or requested is None or former is None:
         return AxisPass(requested, None, refusal)
     bounded, why = _bound(requested, inputs.figures[axis], former.armed_at)

@@ -200,9 +200,9 @@ class _Side:
 
     def _seen(self, direction: int) -> tuple[float, float]:
         """What is known of a direction: from itself, from the other one, or guessed."""
-        other_mm, other_s = self.learned.get(-direction, (0.0, 0.0))
         if direction in self.learned:
             return self.learned[direction]
+        other_mm, other_s = self.learned.get(-direction, (0.0, 0.0))
         if other_mm > _KNOWN_MM:
             return other_mm / other_s * _HINT_DRIVE_S, _HINT_DRIVE_S
         return self.guess_mm_per_s * _GUESS_DRIVE_S, _GUESS_DRIVE_S

@@ -146,17 +146,18 @@ def step(state: State, inputs: Inputs, settings: MachineSettings, rule: RuleSett
     before = state
     state = _lapse(_react(state, inputs), inputs.now_s)
     replies: list[cmd.Reply] = []
-    stop_asked = any(isinstance(c, cmd.Stop) for c in inputs.commands)
-    for n in sorted(range(len(inputs.commands)), key=lambda n: not isinstance(inputs.commands[n], cmd.Stop)):
+    stops = [isinstance(command, cmd.Stop) for command in inputs.commands]
+    for n in sorted(range(len(stops)), key=lambda n: not stops[n]):
         command, heard_s = inputs.commands[n], inputs.now_s - (*inputs.waited_s[n : n + 1], 0.0)[0]
-        if stop_asked and isinstance(command, cmd.Reset):
+        if any(stops) and isinstance(command, cmd.Reset):
             replies.append(
                 cmd.Reply(command="reset", accepted=False, message="stopped this moment", remedy="reset again")
             )
             continue
         state, reply = _obey(state, command, heard_s, inputs, settings)
         replies.append(reply)
-    if state.goals != before.goals:  # taken in this tick: not reached yet, and nothing has held them
+    if state.goals is not before.goals and state.goals != before.goals:
+        # Taken in this tick: not reached yet, and nothing has held them.
         inputs = inputs._replace(settled=False, arrived=False, held=NOTHING_HELD)
     state = _advance(state, inputs, settings, rule)
     armed = state.mode in ARMED

@@ -143,13 +143,13 @@ def axis_sample(name: str, lifecycle: Lifecycle, told: RotatorTelemetry | Actuat
     if lifecycle is not Lifecycle.ACTIVE and torque_on is not None and torque_on.valid and not torque_on.value:
         return None
     return AxisSample(
-        name=name,
-        position=position.value,
-        time_s=position.time_s,
-        velocity=None if velocity is None else velocity.value,
-        goal=told.goal,
-        powered=lifecycle is Lifecycle.ACTIVE,
-        current_a=None if current is None else current.value,
+        name,
+        position.value,
+        position.time_s,
+        None if velocity is None else velocity.value,
+        told.goal,
+        lifecycle is Lifecycle.ACTIVE,
+        None if current is None else current.value,
     )
 
 

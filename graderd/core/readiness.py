@@ -51,9 +51,9 @@ def requirements(
 ) -> tuple[Requirement, ...]:
     """The readiness list at this moment; ``no_auto``: why what sees the soil may not drive, empty where it may."""
     found = [_not_stopped(state)]
-    for name, axis in axes.items():
-        found.append(_connected(name, axis, faults))
-        found.append(_inside_limits(name, pose[name], figures[name]))
+    for name, position in pose.items():
+        found.append(_connected(name, axes[name], faults))
+        found.append(_inside_limits(name, position, figures[name]))
     blocking = [f for f in faults if f.present and _blocks(f)]
     found += [Requirement(f.name, False, True, f.detail or f.row.reads, f.row.remedy) for f in blocking]
     camera = [f for f in faults if f.name.startswith("camera.") and f.present]

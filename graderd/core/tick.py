@@ -251,8 +251,8 @@ class Controller:
         )
         return MappingProxyType(
             {
-                axis: self._axis(axis, result, sensed, pose[axis], axis in former, shares.get(axis, 1.0))
-                for axis, result in passed.items()
+                axis: self._axis(axis, passed[axis], sensed, position, axis in former, shares.get(axis, 1.0))
+                for axis, position in pose.items()
             }
         )
 
@@ -378,5 +378,7 @@ def _side(sensed: Sensed, axis: str) -> SideReading | None:
 
 def _in_the_order_asked(commands: tuple[cmd.AnyCommand, ...], replies: tuple[cmd.Reply, ...]) -> tuple[cmd.Reply, ...]:
     """The machine answers stops first; the replies in the order of the commands."""
+    if len(replies) < 2:
+        return replies
     order = sorted(range(len(commands)), key=lambda i: not isinstance(commands[i], cmd.Stop))
     return tuple(reply for _, reply in sorted(zip(order, replies, strict=True)))
