@@ -28,7 +28,7 @@ BYTE_CODE := $(VENV)/byte-code
 TESTS  := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX=$(abspath $(BYTE_CODE)) OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -p tests.run_times
 BESIDE := -n 2 --dist loadgroup
 # Three quarters of these tests' time is waiting, for virtual devices that move in real time.
-WAITING := -n 5 --dist loadgroup
+WAITING := -n 4 --dist loadgroup
 # Two of three groups at a time: with all three, deadlines are missed that are not ours.
 MACHINES := -n 2 --dist loadgroup
 # What only computes takes what others leave of the processors, and is not missed by them.
