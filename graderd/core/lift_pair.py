@@ -296,7 +296,7 @@ class LiftPair:
         assert right is not None
         elapsed_s = 0.0 if self._last_s is None else min(max(0.0, now_s - self._last_s), 0.2)
         self._last_s = now_s
-        if any(now_s - reading.time_s > self._settings.silent_s for reading in (left, right)):
+        if now_s - min(left.time_s, right.time_s) > self._settings.silent_s:
             return self._pause(now_s)
         for side, reading in zip(self._sides, (left, right), strict=True):
             side.drive(elapsed_s, self._settings.approach_share)
@@ -336,7 +336,7 @@ class LiftPair:
             for side in self._sides:
                 side.start_mm = side.position_mm
                 side.moved_at_s, side.moved_from_mm = now_s, side.position_mm
-        elif all(abs(s.target_mm - t) < _NEW_TARGET_MM for s, t in zip(self._sides, targets_mm, strict=True)):
+        elif not _differ(targets_mm, (self._sides[0].target_mm, self._sides[1].target_mm)):
             return
         else:
             deviations_mm = self._deviations_mm()
@@ -504,4 +504,4 @@ class LiftCoordinator:
 
 
 def _differ(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    return any(abs(a - b) > _NEW_TARGET_MM for a, b in zip(one, other, strict=True))
+    return abs(one[0] - other[0]) > _NEW_TARGET_MM or abs(one[1] - other[1]) > _NEW_TARGET_MM
