@@ -279,8 +279,8 @@ def _agreeing(votes: Votes, rule: RuleSettings) -> Agreeing:
     """The sure votes for what comes, by zone, where they are enough; none where they are for two zones at once."""
     sure: dict[Zone, list[SoilObservation]] = {}
     for vote in votes:
-        told = vote if vote.ahead is None else vote.ahead
-        if told.confidence >= rule.min_confidence:
-            sure.setdefault(told.zone, []).append(vote)
+        coming = vote.coming
+        if coming.confidence >= rule.min_confidence:
+            sure.setdefault(coming.zone, []).append(vote)
     enough = {zone: of for zone, of in sure.items() if len(of) >= rule.votes_needed_n}
     return enough if len(enough) == 1 else {}
